@@ -1,0 +1,142 @@
+"""Step 4, line-blob extraction: colouring of the quintuple image (section 2.2.3, Fig. 13)."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from line_feature_node.core.buffers import Buffers
+from line_feature_node.core.compiling import kernel
+
+#: The attributes of a line-blob, named as in Fig. 13. `select` says whether the label is in use: labels merge while
+#: colouring, and one that merged into another is not. Rows and columns are those of the image.
+BLOB_DTYPE = np.dtype([
+    ('dir', np.int32), ('size', np.int32), ('min_row', np.int32), ('max_row', np.int32), ('min_col', np.int32),
+    ('max_col', np.int32), ('select', np.bool_),
+])
+
+
+class Blobs(NamedTuple):
+    """Line-blobs. The arrays are the extractor's own: a frame's blobs end with the next frame.
+
+    Attributes:
+        attributes: BLOB_DTYPE, one for each label; those with ``select`` are blobs, the rest are empty.
+        members: int32, for each blob its pixels, as indices into the list of edge pixels, one blob after the other:
+            the linked NODEs of Fig. 13 as one array.
+        offsets: int32, where each blob's members start; one more than there are labels.
+    """
+
+    attributes: NDArray[np.void]
+    members: NDArray[np.int32]
+    offsets: NDArray[np.int32]
+
+
+def extract_blobs(
+    pixels: NDArray[np.int32], codes: NDArray[np.uint8], shape: tuple[int, int], margin: int, buffers: Buffers,
+) -> Blobs:
+    """Group 8-connected edge pixels of one code.
+
+    Args:
+        pixels: Flat index of each edge pixel in the padded image; no pixel twice.
+        codes: Code of each, 1 to 4: the quintuple image as the list of what is not background.
+        shape: Rows and columns of the padded image.
+        margin: Its padding on each side, one pixel at least.
+        buffers: Memory to work in.
+    """
+    most, stride = pixels.size, shape[1]
+    labels = buffers.array('labels', most, np.int32)
+    parents = buffers.array('parents', most, np.int32)
+    colours = buffers.array('colours', shape[0] * stride, np.int32, zeros=True)
+    used = colour(pixels, codes, stride, colours, labels, parents)
+    attributes = buffers.array('blobs', used, BLOB_DTYPE)[:used]
+    members = buffers.array('members', most, np.int32)[:most]
+    offsets = buffers.array('blob offsets', used + 1, np.int32)[:used + 1]
+    collect(pixels, codes, stride, margin, labels, parents, attributes, members, offsets)
+    return Blobs(attributes, members, offsets)
+
+
+@kernel
+def root(parents: Any, label: int) -> int:
+    """The label that a label merged into at last, halving the way there for later."""
+    while parents[label] != label:
+        parents[label] = parents[parents[label]]
+        label = parents[label]
+    return label
+
+
+@kernel
+def colour(pixels: Any, codes: Any, stride: int, colours: Any, labels: Any, parents: Any) -> int:
+    """Give each pixel a label that it shares with a neighbour of its code, and merge the labels that meet in it."""
+    used = 0
+    for k in range(pixels.size):
+        pixel, code = np.int64(pixels[k]), codes[k]
+        label = -1
+        for row in (pixel - stride, pixel, pixel + stride):
+            for neighbour in range(row - 1, row + 2):
+                # A colour is 8 (label + 1) + code; 0 is background or not yet seen.
+                found = colours[neighbour]
+                if found & 7 == code:
+                    other = (found >> 3) - 1
+                    if label == -1:
+                        label = other
+                    elif other != label:
+                        a, b = root(parents, label), root(parents, other)
+                        parents[max(a, b)] = min(a, b)
+        if label == -1:
+            label = used
+            parents[used] = used
+            used += 1
+        labels[k] = label
+        colours[pixel] = (label + 1) << 3 | code
+    for k in range(pixels.size):
+        colours[pixels[k]] = 0
+    return used
+
+
+@kernel
+def collect(
+    pixels: Any, codes: Any, stride: int, margin: int, labels: Any, parents: Any, blobs: Any, members: Any,
+    offsets: Any,
+) -> None:
+    """Bring each pixel to its final label, and fill in the attributes and members of the blobs."""
+    for label in range(blobs.size):
+        clear(blobs[label])
+        blobs[label]['select'] = parents[label] == label
+    for k in range(pixels.size):
+        label = root(parents, labels[k])
+        labels[k] = label
+        row = pixels[k] // stride
+        include(blobs[label], codes[k], row - margin, pixels[k] - row * stride - margin)
+    total = 0
+    for label in range(blobs.size):
+        offsets[label] = total
+        total += blobs[label]['size']
+    for k in range(pixels.size):
+        members[offsets[labels[k]]] = k
+        offsets[labels[k]] += 1
+    # Each offset has moved to where the next blob starts.
+    for label in range(blobs.size, 0, -1):
+        offsets[label] = offsets[label - 1]
+    offsets[0] = 0
+
+
+@kernel
+def clear(blob: Any) -> None:
+    """Empty a blob."""
+    blob['dir'] = 0
+    blob['size'] = 0
+    blob['min_row'] = 2147483647
+    blob['min_col'] = 2147483647
+    blob['max_row'] = -1
+    blob['max_col'] = -1
+
+
+@kernel
+def include(blob: Any, code: int, row: int, column: int) -> None:
+    """Add a pixel to a blob."""
+    blob['dir'] = code
+    blob['size'] += 1
+    blob['min_row'] = min(blob['min_row'], row)
+    blob['max_row'] = max(blob['max_row'], row)
+    blob['min_col'] = min(blob['min_col'], column)
+    blob['max_col'] = max(blob['max_col'], column)

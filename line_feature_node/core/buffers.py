@@ -1,0 +1,34 @@
+"""Memory that an extractor keeps from frame to frame, so that nothing is allocated in the hot path."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+
+class Buffers:
+    """Arrays by name, each as large as the largest frame so far needed it.
+
+    What an array holds at first is unspecified, but for those asked for with ``zeros``: their users leave them as
+    they found them, all zero.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def array(self, name: str, size: int, dtype: DTypeLike, *, zeros: bool = False) -> NDArray[Any]:
+        """A one-dimensional array of at least that size, always the same one until a larger one is needed."""
+        array = self._arrays.get(name)
+        if array is None or array.size < size:
+            # A video's frames differ a little: room to grow saves most of them from allocating.
+            room = size + size // 4
+            array = np.zeros(room, dtype) if zeros else np.empty(room, dtype)
+            self._arrays[name] = array
+        return array
+
+    def image(self, name: str, height: int, width: int, dtype: DTypeLike) -> NDArray[Any]:
+        """A two-dimensional array of exactly that size, zero when it is new."""
+        array = self._arrays.get(name)
+        if array is None or array.shape != (height, width):
+            array = self._arrays[name] = np.zeros((height, width), dtype)
+        return array

@@ -1,0 +1,419 @@
+"""Step 2, edge scanning: hysteresis and chains of edge pixels by eight-directional chain coding (section 2.2.1).
+
+Directions are those of the chain code: 0 is +x, then in steps of 45 degrees from +x towards +y, so that 2 is down.
+
+Where a chain starts and how it is walked: the marks are read from the top, left to right, and the first strong pixel
+that no chain has yet is a seed. The chain runs through it along the edge, in the direction that its code gives (down
+for a vertical edge, to the lower left, to the left and to the upper left for codes 1 to 4), and reaches as far as the
+edge goes both ways. At each pixel it goes on to the unvisited neighbour that bends least, by a right angle at most;
+of two that bend alike it takes the one that turns back, as a digital straight line does. What it leaves beside
+itself starts chains of its own, so all that is connected to a strong pixel is visited: that is the hysteresis.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from line_feature_node.core.buffers import Buffers
+from line_feature_node.core.compiling import kernel
+from line_feature_node.core.edges import CODE, STRONG
+from line_feature_node.core.parameters import Parameters
+
+#: Column and row steps of the eight directions.
+STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+#: A mark of a pixel that belongs to a chain already, or fills a gap.
+TAKEN = 16
+#: The strong bit of eight marks at once.
+STRONG_WORD = np.uint64(STRONG * 0x0101010101010101)
+#: A chain turns by at most this many directions at once.
+SHARPEST = 2
+#: The direction of a chain at its end is measured over this many pixels.
+REACH = 4
+
+
+def _next_direction() -> NDArray[np.uint8]:
+    """Where a chain goes on: indexed by direction, sign of its last turn (0 left, 1 right) and mask of neighbours.
+
+    Bit d of the mask stands for an unvisited neighbour in direction d; 255 means that the chain ends.
+    """
+    table = np.full((8, 2, 256), 255, np.uint8)
+    for direction in range(8):
+        for right in range(2):
+            back = -1 if right else 1
+            turns = [0, *(k * sign for k in range(1, SHARPEST + 1) for sign in (back, -back))]
+            for mask in range(256):
+                for turn in turns:
+                    if mask >> (direction + turn) % 8 & 1:
+                        table[direction, right, mask] = (direction + turn) % 8
+                        break
+    return table
+
+
+def _fan(longest: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pixels in which the other side of a gap is looked for: nearest first, then those that bend least.
+
+    Returns:
+        Column and row steps, 8×M each, for a chain that ends in each direction; offsets of the first step of each
+        distance, gaps of 0 to `longest` pixels.
+    """
+    steps, counts = [], []
+    for direction in range(8):
+        tangent = np.array([STEP_X[direction], STEP_Y[direction]]) / np.hypot(STEP_X[direction], STEP_Y[direction])
+        rings = []
+        for distance in range(1, longest + 2):
+            ring = [(x, y) for x in range(-distance, distance + 1) for y in range(-distance, distance + 1)
+                    if max(abs(x), abs(y)) == distance]
+            along = {(x, y): (x * tangent[0] + y * tangent[1]) / np.hypot(x, y) for x, y in ring}
+            rings.append(sorted((step for step in ring if along[step] > np.cos(np.radians(46))),
+                                key=lambda step: (-round(along[step], 9), step)))
+        counts = [len(ring) for ring in rings]
+        steps.append([step for ring in rings for step in ring])
+    return np.array(steps), np.cumsum([0, *counts])
+
+
+NEXT_DIRECTION = _next_direction()
+FAN, FAN_OFFSETS = _fan(8)
+
+
+class Chains(NamedTuple):
+    """Edge chains. The arrays are the extractor's own: a frame's chains end with the next frame.
+
+    Attributes:
+        pixels: int32, pixels of all chains one after the other, as flat indices into the marks.
+        codes: uint8, gradient direction code of each pixel.
+        directions: uint8, chain code: direction from each pixel to the next; 255 at the end of an open chain.
+        bridged: bool, whether the pixel fills a gap.
+        offsets: int32, where each chain starts in these; one more than there are chains.
+        closed: bool, whether the end of each chain meets its start.
+    """
+
+    pixels: NDArray[np.int32]
+    codes: NDArray[np.uint8]
+    directions: NDArray[np.uint8]
+    bridged: NDArray[np.bool_]
+    offsets: NDArray[np.int32]
+    closed: NDArray[np.bool_]
+
+
+def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffers) -> Chains:
+    """Follow the candidates in the marks from strong ones, and link them to chains.
+
+    Args:
+        marks: As edge extraction leaves them; pixels that were visited become TAKEN.
+        parameters: max_gap and min_chain are used.
+        buffers: Memory to work in.
+
+    Returns:
+        The chains of at least min_chain pixels.
+    """
+    flat = marks.reshape(-1)
+    stride = marks.shape[1]
+    most = int(np.count_nonzero(flat))
+    raw_pixels, raw_codes = buffers.array('raw pixels', most, np.int32), buffers.array('raw codes', most, np.uint8)
+    raw_offsets = buffers.array('raw offsets', most + 1, np.int32)
+    raw = trace(flat, flat.view(np.uint64), stride, NEXT_DIRECTION, raw_pixels, raw_codes, raw_offsets,
+                buffers.array('stack', most, np.int32))
+    links = buffers.array('links', 2 * raw, np.int32)
+    link_gaps(flat, stride, raw, parameters.max_gap, FAN, FAN_OFFSETS, raw_pixels, raw_codes, raw_offsets,
+              buffers.array('ends', flat.size, np.int32, zeros=True), links)
+    most += parameters.max_gap * raw
+    pixels, codes = buffers.array('pixels', most, np.int32), buffers.array('codes', most, np.uint8)
+    directions, bridged = buffers.array('directions', most, np.uint8), buffers.array('bridged', most, np.bool_)
+    offsets, closed = buffers.array('offsets', raw + 1, np.int32), buffers.array('closed', raw, np.bool_)
+    count = assemble(stride, raw, parameters.min_chain, raw_pixels, raw_codes, raw_offsets, links,
+                     buffers.array('done', raw, np.bool_), pixels, codes, directions, bridged, offsets, closed)
+    length = offsets[count]
+    return Chains(pixels[:length], codes[:length], directions[:length], bridged[:length], offsets[:count + 1],
+                  closed[:count])
+
+
+@kernel
+def trace(
+    marks: Any, words: Any, stride: int, table: Any, pixels: Any, codes: Any, offsets: Any, stack: Any,
+) -> int:
+    """Visit all candidates that are connected to a strong one; return the number of chains that this made."""
+    chains = 0
+    length = 0
+    offsets[0] = 0
+    for word in range(words.size):
+        if words[word] & STRONG_WORD == 0:
+            continue
+        for seed in range(8 * word, 8 * word + 8):
+            if marks[seed] & STRONG == 0:
+                continue
+            length, top = trace_chain(seed, marks, stride, table, pixels, codes, length, stack, 0)
+            chains += 1
+            offsets[chains] = length
+            while top > 0:
+                top -= 1
+                beside = stack[top]
+                for direction in range(8):
+                    start = beside + STEP_X[direction] + stride * STEP_Y[direction]
+                    if is_open(marks[start]):
+                        length, top = trace_chain(start, marks, stride, table, pixels, codes, length, stack, top)
+                        chains += 1
+                        offsets[chains] = length
+    return chains
+
+
+@kernel
+def is_open(mark: int) -> bool:
+    """Whether a mark is that of a candidate that no chain has yet."""
+    return (mark != 0) & (mark != TAKEN)
+
+
+@kernel
+def trace_chain(
+    start: int, marks: Any, stride: int, table: Any, pixels: Any, codes: Any, length: int, stack: Any, top: int,
+) -> tuple[int, int]:
+    """Append the chain through a pixel: first its arm against the edge's direction, turned round, then that along it.
+
+    Returns:
+        The number of pixels in all chains, and of entries on the stack.
+    """
+    first = length
+    code = marks[start] & CODE
+    direction = (code + 1) % 8
+    marks[start] = TAKEN
+    length, top = walk(start, (direction + 4) % 8, marks, stride, table, pixels, codes, length, stack, top)
+    reverse(pixels, first, length)
+    reverse(codes, first, length)
+    pixels[length] = start
+    codes[length] = code
+    length, top = walk(start, direction, marks, stride, table, pixels, codes, length + 1, stack, top)
+    if open_neighbours(marks, start, stride) != 0:
+        stack[top] = start
+        top += 1
+    return length, top
+
+
+@kernel
+def walk(
+    start: int, direction: int, marks: Any, stride: int, table: Any, pixels: Any, codes: Any, length: int, stack: Any,
+    top: int,
+) -> tuple[int, int]:
+    """Append the pixels that follow the start in a direction, and put those beside which others stay on the stack."""
+    pixel = start
+    right = 0
+    while True:
+        mask = open_neighbours(marks, pixel, stride)
+        if mask == 0:
+            break
+        following = table[direction, right, mask]
+        if pixel != start and (following == 255 or mask & (mask - 1) != 0):
+            stack[top] = pixel
+            top += 1
+        if following == 255:
+            break
+        turn = (following - direction) % 8
+        if turn != 0:
+            right = 1 if turn < 4 else 0
+        direction = following
+        pixel += STEP_X[direction] + stride * STEP_Y[direction]
+        pixels[length] = pixel
+        codes[length] = marks[pixel] & CODE
+        marks[pixel] = TAKEN
+        length += 1
+    return length, top
+
+
+@kernel
+def open_neighbours(marks: Any, pixel: int, stride: int) -> int:
+    """The mask of a pixel: bit d is set where the neighbour in direction d is a candidate that no chain has yet."""
+    above, below = pixel - stride, pixel + stride
+    return (is_open(marks[pixel + 1]) | is_open(marks[below + 1]) << 1 | is_open(marks[below]) << 2
+            | is_open(marks[below - 1]) << 3 | is_open(marks[pixel - 1]) << 4 | is_open(marks[above - 1]) << 5
+            | is_open(marks[above]) << 6 | is_open(marks[above + 1]) << 7)
+
+
+@kernel
+def reverse(values: Any, first: int, end: int) -> None:
+    """Turn round values[first:end] in place."""
+    last = end - 1
+    while first < last:
+        values[first], values[last] = values[last], values[first]
+        first += 1
+        last -= 1
+
+
+@kernel
+def link_gaps(
+    marks: Any, stride: int, chains: int, max_gap: int, fan: Any, fan_offsets: Any, pixels: Any, codes: Any,
+    offsets: Any, ends: Any, links: Any,
+) -> None:
+    """Link the ends of chains over gaps of up to max_gap pixels, the shortest gaps first.
+
+    End 2 c is the start of chain c, 2 c + 1 its end. Two ends are linked when the one lies in the fan of directions
+    that the other points to, the two point at each other, within 45 degrees, their codes are equal or neighbours, and
+    nothing lies between. A chain of one pixel points nowhere and is not linked.
+    """
+    links[:2 * chains] = -1
+    for end in range(2 * chains):
+        if offsets[end // 2 + 1] - offsets[end // 2] > 1:
+            ends[pixels[end_index(offsets, end)]] = end + 1
+    for gap in range(max_gap + 1):
+        for end in range(2 * chains):
+            chain = end // 2
+            if links[end] != -1 or offsets[chain + 1] - offsets[chain] < 2:
+                continue
+            index = end_index(offsets, end)
+            pixel = pixels[index]
+            column = pixel % stride
+            direction = end_direction(pixels, offsets, end, stride)
+            for k in range(fan_offsets[gap], fan_offsets[gap + 1]):
+                step_x, step_y = fan[direction, k, 0], fan[direction, k, 1]
+                target = pixel + step_x + step_y * stride
+                if not (0 <= column + step_x < stride and 0 <= target < ends.size):
+                    continue
+                other = ends[target] - 1
+                if other < 0 or other == end or links[other] != -1:
+                    continue
+                facing = (end_direction(pixels, offsets, other, stride) - direction + 4 + 1) % 8 <= 2
+                between = (codes[index] - codes[end_index(offsets, other)]) % 4
+                if facing and between != 2 and is_free(marks, pixel, target, gap, stride):
+                    links[end] = other
+                    links[other] = end
+                    break
+    for end in range(2 * chains):
+        ends[pixels[end_index(offsets, end)]] = 0
+
+
+@kernel
+def end_index(offsets: Any, end: int) -> int:
+    """Where the pixel of an end stands."""
+    return offsets[end // 2] if end % 2 == 0 else offsets[end // 2 + 1] - 1
+
+
+@kernel
+def end_direction(pixels: Any, offsets: Any, end: int, stride: int) -> int:
+    """The chain-code direction in which a chain of two pixels or more leaves over one of its ends."""
+    chain = end // 2
+    index = end_index(offsets, end)
+    reach = min(REACH, offsets[chain + 1] - offsets[chain] - 1)
+    inner = pixels[index + reach if end % 2 == 0 else index - reach]
+    x = pixels[index] % stride - inner % stride
+    y = pixels[index] // stride - inner // stride
+    # 2 : 5 stands for tan 22.5 degrees, which no pair of steps up to REACH can tell from it.
+    if 5 * abs(y) < 2 * abs(x):
+        return 0 if x > 0 else 4
+    if 5 * abs(x) < 2 * abs(y):
+        return 2 if y > 0 else 6
+    if y > 0:
+        return 1 if x > 0 else 3
+    return 7 if x > 0 else 5
+
+
+@kernel
+def gap_pixel(pixel: int, target: int, k: int, gap: int, stride: int) -> int:
+    """The k-th of the `gap` pixels on the digital straight line between two pixels; 0 is the pixel itself."""
+    x, y = pixel % stride, pixel // stride
+    span_x, span_y = target % stride - x, target // stride - y
+    steps = gap + 1
+    return (x + (2 * span_x * k + steps) // (2 * steps)) + (y + (2 * span_y * k + steps) // (2 * steps)) * stride
+
+
+@kernel
+def is_free(marks: Any, pixel: int, target: int, gap: int, stride: int) -> bool:
+    """Whether the pixels between two ends belong to nothing; if so, they are taken."""
+    for k in range(1, gap + 1):
+        if marks[gap_pixel(pixel, target, k, gap, stride)] != 0:
+            return False
+    for k in range(1, gap + 1):
+        marks[gap_pixel(pixel, target, k, gap, stride)] = TAKEN
+    return True
+
+
+@kernel
+def assemble(
+    stride: int, raw: int, min_chain: int, raw_pixels: Any, raw_codes: Any, raw_offsets: Any, links: Any, done: Any,
+    pixels: Any, codes: Any, directions: Any, bridged: Any, offsets: Any, closed: Any,
+) -> int:
+    """Write out the linked chains with their gaps filled, without the short ones; return their number."""
+    done[:raw] = False
+    chains = 0
+    length = 0
+    offsets[0] = 0
+    for chain in range(raw):
+        if done[chain]:
+            continue
+        start = first_end(chain, links)
+        first = length
+        end = start
+        while True:
+            length = append(end, raw_pixels, raw_codes, raw_offsets, pixels, codes, bridged, length)
+            done[end // 2] = True
+            following = links[end ^ 1]
+            if following == -1:
+                break
+            length = bridge(raw_pixels[end_index(raw_offsets, following)], stride, pixels, codes, bridged, length)
+            if following == start:
+                break
+            end = following
+        if length - first < min_chain:
+            length = first
+            continue
+        closed[chains] = length - first >= 4 and are_neighbours(pixels[length - 1], pixels[first], stride)
+        chain_codes(pixels, first, length, closed[chains], stride, directions)
+        chains += 1
+        offsets[chains] = length
+    return chains
+
+
+@kernel
+def first_end(chain: int, links: Any) -> int:
+    """The end at which the chain of linked chains begins; that of the chain itself where they form a ring."""
+    end = 2 * chain
+    while links[end] != -1:
+        end = links[end] ^ 1
+        if end == 2 * chain:
+            break
+    return end
+
+
+@kernel
+def append(
+    end: int, raw_pixels: Any, raw_codes: Any, raw_offsets: Any, pixels: Any, codes: Any, bridged: Any, length: int,
+) -> int:
+    """Copy a raw chain, beginning with the given end of it."""
+    first, last = raw_offsets[end // 2], raw_offsets[end // 2 + 1]
+    for k in range(last - first):
+        source = first + k if end % 2 == 0 else last - 1 - k
+        pixels[length + k] = raw_pixels[source]
+        codes[length + k] = raw_codes[source]
+        bridged[length + k] = False
+    return length + last - first
+
+
+@kernel
+def bridge(target: int, stride: int, pixels: Any, codes: Any, bridged: Any, length: int) -> int:
+    """Fill the gap between the last pixel and the target with a digital straight line of the last pixel's code."""
+    pixel, code = pixels[length - 1], codes[length - 1]
+    gap = max(abs(target % stride - pixel % stride), abs(target // stride - pixel // stride)) - 1
+    for k in range(1, gap + 1):
+        pixels[length] = gap_pixel(pixel, target, k, gap, stride)
+        codes[length] = code
+        bridged[length] = True
+        length += 1
+    return length
+
+
+@kernel
+def are_neighbours(a: int, b: int, stride: int) -> bool:
+    """Whether two different pixels touch."""
+    step = abs(a - b)
+    return step == 1 or (stride - 1 <= step <= stride + 1)
+
+
+@kernel
+def chain_codes(pixels: Any, first: int, end: int, closed: bool, stride: int, directions: Any) -> None:
+    """Write the direction from each pixel of a chain to the next."""
+    for k in range(first, end):
+        if k + 1 == end and not closed:
+            directions[k] = 255
+            break
+        step = pixels[k + 1 if k + 1 < end else first] - pixels[k]
+        down = (step > 1) - (step < -1)
+        right = step - down * stride
+        directions[k] = (2 - right if down == 1 else 6 + right) if down != 0 else (0 if right == 1 else 4)
