@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import kernel
 from line_feature_node.core.parameters import Parameters
+from line_feature_node.core.vectors import LANES, TILE, load, multiply, multiply_add, store, transpose
 
 #: In a mark: the direction code, 1 to 4, of a pixel that passed the suppression and exceeds T2; 0 is background.
 CODE = 7
@@ -26,13 +27,13 @@ STRONG = 8
 
 #: Replicated pixels on each side of a plane, and of zeros on each side of the marks.
 PAD, MARGIN = 2, 1
-#: Rows that the horizontal recursion takes at once. Several vector registers hide the latency of its steps; a power
-#: of two would put all of a column's rows into the same few cache sets (16, 32, 48, 64: 1.13, 1.21, 1, 1.25 in time).
-LANES = 48
 #: Pixels whose norms differ by less than this part count as equal, so that a ramp has no edge in its interior.
 FLAT = np.float32(1e-3)
 #: Norms that differ by less than this part are a tie, which the first along the gradient wins: far above rounding.
 TIE = np.float32(2e-5)
+ONE = np.float32(1)
+#: Marks as single bytes, so that a row of them is computed as bytes.
+NO_MARK, CODE_1, CODE_2, CODE_3, CODE_4, STRONG_MARK = (np.uint8(mark) for mark in (0, 1, 2, 3, 4, STRONG))
 #: Half a section of the gradient space is 22.5 degrees.
 SECTION = np.float32(math.tan(math.pi / 8))
 #: Added to every pixel: the recursion would fade into denormal numbers, which are slow, beside a black area.
@@ -54,8 +55,8 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
         T1, and 0 elsewhere; padded by MARGIN on each side, and at the right to a multiple of eight columns.
     """
     height, width = image.shape
-    # Whole strips of rows and whole registers of columns fit in, with the padding.
-    plane = buffers.image('plane', -(-height // LANES) * LANES + 2 * PAD, -(-(width + 2 * PAD) // 16) * 16, np.float32)
+    # Whole strips of rows and whole tiles of columns fit in, with the padding.
+    plane = buffers.image('plane', -(-height // LANES) * LANES + 2 * PAD, -(-(width + 2 * PAD) // TILE) * TILE, np.float32)
     rows = buffers.image('rows', 12, plane.shape[1], np.float32)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     scale, offset = intensity_map(image.dtype, parameters)
@@ -63,7 +64,7 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     recursive = parameters.operator == 'deriche'
     if recursive:
         side, centre = deriche_stencil(parameters.alpha)
-        strip = buffers.image('strip', width + 2 * PAD, LANES, np.float32)
+        strip = buffers.array('strip', plane.shape[1] * LANES, np.float32)
         smooth_forward(image, scale, offset, q, strip, plane, rows[0])
     else:
         side, centre = STENCILS[parameters.operator]
@@ -109,18 +110,18 @@ def copy_replicated(image: Any, scale: float, offset: float, plane: Any) -> None
 
 
 @kernel
-def smooth_forward(
-    image: Any, scale: float, offset: float, q: float, strip: Any, plane: Any, last: Any,
-) -> None:
+def smooth_forward(image: Any, scale: float, offset: float, q: float, strip: Any, plane: Any, last: Any) -> None:
     """Smooth the rows by E * E, and the columns by its causal half; the sweep does the other half on its way up.
 
-    The two rows below the image receive the start values of that half.
+    The two rows below the image receive the start values of that half. The strip holds LANES rows, column after
+    column, as many columns as the plane has.
     """
     height, width = image.shape
     for first in range(0, height, LANES):
-        load_transposed(image, first, np.float32(scale), np.float32(offset), strip)
-        smooth_strip(strip, np.float32(q))
-        store_transposed(strip, plane, first + PAD)
+        load_rows(image, first, np.float32(scale), np.float32(offset), plane)
+        turn(plane, first + PAD, strip)
+        smooth_strip(strip, width, np.float32(q))
+        turn_back(strip, plane, first + PAD)
         if first == 0:
             plane[0] = plane[PAD]
             plane[1] = plane[PAD]
@@ -129,44 +130,80 @@ def smooth_forward(
                 last[:] = plane[row]
             recur(plane[row], plane[row - 1], plane[row - 2], np.float32(q))
     bottom = height + PAD - 1
-    anticausal_start(last, plane[bottom], plane[bottom - 1], plane[bottom + 1], plane[bottom + 2], np.float32(q))
+    start_upwards(last, plane[bottom], plane[bottom - 1], plane[bottom + 1], plane[bottom + 2], np.float32(q))
 
 
 @kernel
-def load_transposed(image: Any, first: int, scale: Any, offset: Any, strip: Any) -> None:
-    """Bring LANES rows of the image into the strip as grey levels, the last row standing in for those below it."""
+def load_rows(image: Any, first: int, scale: Any, offset: Any, plane: Any) -> None:
+    """Bring LANES rows of the image into the plane as grey levels, the last row standing in for those below it."""
     height, width = image.shape
     for lane in range(LANES):
         source = image[min(first + lane, height - 1)]
+        target = plane[first + lane + PAD, PAD:PAD + width]
         for column in range(width):
-            strip[column + PAD, lane] = scale * np.float32(source[column]) + offset
+            target[column] = scale * np.float32(source[column]) + offset
 
 
 @kernel
-def store_transposed(strip: Any, plane: Any, first: int) -> None:
-    """Write the strip into LANES rows of the plane."""
-    for lane in range(LANES):
-        target = plane[first + lane]
-        for column in range(strip.shape[0]):
-            target[column] = strip[column, lane]
+def turn(plane: Any, first: int, strip: Any) -> None:
+    """Bring LANES rows of the plane into the strip."""
+    rows, stride = plane.reshape(-1), plane.shape[1]
+    for column in range(0, stride, TILE):
+        for lane in range(0, LANES, TILE):
+            transpose(rows, (first + lane) * stride + column, stride, strip, column * LANES + lane, LANES)
 
 
 @kernel
-def smooth_strip(strip: Any, q: Any) -> None:
-    """Smooth along x, all lanes at once: E * E as a causal and an anticausal pass over the replicated row."""
-    end = strip.shape[0] - PAD
-    x = np.empty(LANES, np.float32)
-    x[:] = strip[end - 1]
-    strip[0] = strip[PAD]
-    strip[1] = strip[PAD]
+def turn_back(strip: Any, plane: Any, first: int) -> None:
+    """Bring the strip into LANES rows of the plane."""
+    rows, stride = plane.reshape(-1), plane.shape[1]
+    for column in range(0, stride, TILE):
+        for lane in range(0, LANES, TILE):
+            transpose(strip, column * LANES + lane, LANES, rows, (first + lane) * stride + column, stride)
+
+
+@kernel
+def smooth_strip(strip: Any, width: int, q: Any) -> None:
+    """Smooth along x, all lanes at once: E * E as a causal and an anticausal pass over the replicated rows."""
     gain, first, second = (1 - q) * (1 - q), 2 * q, -q * q
-    for column in range(PAD, end):
-        for i in range(LANES):
-            strip[column, i] = first * strip[column - 1, i] + (second * strip[column - 2, i] + gain * strip[column, i])
-    anticausal_start(x, strip[end - 1], strip[end - 2], strip[end], strip[end + 1], q)
-    for column in range(end - 1, -1, -1):
-        for i in range(LANES):
-            strip[column, i] = first * strip[column + 1, i] + (second * strip[column + 2, i] + gain * strip[column, i])
+    end = (width + PAD) * LANES
+    x = load(strip, end - LANES)
+    y1 = y2 = load(strip, PAD * LANES)
+    store(strip, 0, y1)
+    store(strip, LANES, y1)
+    for k in range(PAD * LANES, end, LANES):
+        y = multiply_add(first, y1, multiply_add(second, y2, multiply(gain, load(strip, k))))
+        store(strip, k, y)
+        y1, y2 = y, y1
+    of_x, of_u, of_u1 = start_weights(q, 1)
+    v1 = multiply_add(of_x, x, multiply_add(of_u, y1, multiply(of_u1, y2)))
+    of_x, of_u, of_u1 = start_weights(q, 2)
+    v2 = multiply_add(of_x, x, multiply_add(of_u, y1, multiply(of_u1, y2)))
+    store(strip, end, v1)
+    store(strip, end + LANES, v2)
+    y1, y2 = v1, v2
+    for k in range(end - LANES, -1, -LANES):
+        y = multiply_add(first, y1, multiply_add(second, y2, multiply(gain, load(strip, k))))
+        store(strip, k, y)
+        y1, y2 = y, y1
+
+
+@kernel
+def start_weights(q: Any, k: int) -> tuple[Any, Any, Any]:
+    """The exact start of the anticausal pass v, k steps behind the end, where x goes on for ever.
+
+    There the causal pass u decays to x as (A + B j) q^j, with A and B from its last two values, and v is the
+    anticausal pass over that decay: a sum in closed form (Triggs and Sdika, 2006, solve for it in general).
+
+    Returns:
+        Weights of x, of the last u and of the u before it.
+    """
+    r = q * q
+    share = (1 - q) * (1 - q) / ((1 - r) * (1 - r)) * (q if k == 1 else r)
+    tail = 2 * r / (1 - r)
+    of_u = share * (k + 1 + tail)
+    of_u1 = -share * q * (k + tail)
+    return np.float32(1 - of_u - of_u1), np.float32(of_u), np.float32(of_u1)
 
 
 @kernel
@@ -178,20 +215,12 @@ def recur(y: Any, y1: Any, y2: Any, q: Any) -> None:
 
 
 @kernel
-def anticausal_start(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
-    """The exact start of the anticausal pass where x goes on for ever (after Triggs and Sdika, 2006).
-
-    Behind the end the causal pass u decays to x as (A + B k) q^k; v1 and v2 are the anticausal pass over that decay,
-    one and two steps behind the end.
-    """
-    r = q * q
-    share = (1 - q) * (1 - q) / ((1 - r) * (1 - r))
-    tail = 2 * r / (1 - r)
-    for i in range(x.size):
-        a = u[i] - x[i]
-        b = a - q * (u1[i] - x[i])
-        v1[i] = x[i] + share * q * (a + b * (1 + tail))
-        v2[i] = x[i] + share * r * (a + b * (2 + tail))
+def start_upwards(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
+    """Write the two rows below the image with which the vertical anticausal pass starts."""
+    for k, v in ((1, v1), (2, v2)):
+        of_x, of_u, of_u1 = start_weights(q, k)
+        for i in range(x.size):
+            v[i] = of_x * x[i] + (of_u * u[i] + of_u1 * u1[i])
 
 
 @kernel
@@ -242,27 +271,32 @@ def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2:
     |gx| - |gy| and |gy| for a flat gradient, so that all sides of a comparison are multiplied by |gx| instead of
     dividing. It stays when greater than both. A tie is won by its first pixel: forward may be equal, backward not.
     """
-    low, high, flat = np.float32(1) - TIE, np.float32(1) + TIE, np.float32(1) - FLAT
     for i in range(marks.size):
         j = i + PAD
         x, y = gx[j], gy[j]
         ax, ay = abs(x), abs(y)
-        steep = ay > ax
-        same = x * y > 0
-        large, small = max(ax, ay), min(ax, ay)
+        steep, same = ay > ax, x * y > 0
+        aside = ax if steep else ay
+        ahead = (ay if steep else ax) - aside
         north, south, east, west = above[j], below[j], middle[j + 1], middle[j - 1]
         northeast, northwest, southeast, southwest = above[j + 1], above[j - 1], below[j + 1], below[j - 1]
-        ahead = south if steep else east
-        behind = north if steep else west
-        across_ahead = southwest if steep else northeast
-        across_behind = northeast if steep else southwest
-        ahead_beside = southeast if same else across_ahead
-        behind_beside = northwest if same else across_behind
-        forward = (large - small) * ahead + small * ahead_beside
-        backward = (large - small) * behind + small * behind_beside
         norm = middle[j]
-        own = norm * large
-        code = 1 if ay <= SECTION * ax else (3 if ax <= SECTION * ay else (2 if same else 4))
-        maximal = (forward <= high * own) & (backward < low * own) & (min(forward, backward) < flat * own)
-        mark = code + STRONG if norm > T1 else code
-        marks[i] = np.uint8(mark if maximal & (norm > T2) else 0)
+        own = norm * (ahead + aside)
+        # Both answers are computed: to select among the neighbours first would make gather instructions of the loads.
+        flat_maximum = is_maximum(own, ahead * east + aside * (southeast if same else northeast),
+                                  ahead * west + aside * (northwest if same else southwest))
+        steep_maximum = is_maximum(own, ahead * south + aside * (southeast if same else southwest),
+                                   ahead * north + aside * (northwest if same else northeast))
+        maximum = (steep & steep_maximum) | ((not steep) & flat_maximum)
+        code = CODE_2 if same else CODE_4
+        code = CODE_3 if ax <= SECTION * ay else code
+        code = CODE_1 if ay <= SECTION * ax else code
+        code = code | (STRONG_MARK if norm > T1 else NO_MARK)
+        marks[i] = code if maximum & (norm > T2) else NO_MARK
+
+
+@kernel
+def is_maximum(own: Any, forward: Any, backward: Any) -> bool:
+    """Whether a norm is greater than the two beside it, or the first of two equal ones; but not within a ramp."""
+    return ((forward <= (ONE + TIE) * own) & (backward < (ONE - TIE) * own)
+            & ((forward < (ONE - FLAT) * own) | (backward < (ONE - FLAT) * own)))

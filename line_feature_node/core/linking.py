@@ -95,12 +95,18 @@ def adjacent(first: Any, second: Any, tau2: float) -> bool:
 @kernel
 def nearest_ends(first: Any, second: Any) -> tuple[float, int]:
     """The smallest distance between ends of two lines; and between which, as 2 (end of first) + (end of second)."""
-    a = np.hypot(first['x1'] - second['x1'], first['y1'] - second['y1'])
-    b = np.hypot(first['x1'] - second['x2'], first['y1'] - second['y2'])
-    c = np.hypot(first['x2'] - second['x1'], first['y2'] - second['y1'])
-    d = np.hypot(first['x2'] - second['x2'], first['y2'] - second['y2'])
+    a = squared(first['x1'] - second['x1'], first['y1'] - second['y1'])
+    b = squared(first['x1'] - second['x2'], first['y1'] - second['y2'])
+    c = squared(first['x2'] - second['x1'], first['y2'] - second['y1'])
+    d = squared(first['x2'] - second['x2'], first['y2'] - second['y2'])
     gap = min(min(a, b), min(c, d))
-    return gap, (0 if a == gap else (1 if b == gap else (2 if c == gap else 3)))
+    return np.sqrt(gap), (0 if a == gap else (1 if b == gap else (2 if c == gap else 3)))
+
+
+@kernel
+def squared(x: float, y: float) -> float:
+    """Square of a distance."""
+    return x * x + y * y
 
 
 @kernel

@@ -69,7 +69,7 @@ class Parameters:
     max_gap: int = _parameter(2, 'Longest gap in a broken edge that is bridged.', low=0, high=8, unit='pixels')
     min_chain: int = _parameter(8, 'Shorter edge chains are dropped.', low=1, high=100000, unit='pixels')
     n: int = _parameter(
-        12, 'Window of the edge normalisation, before and after; 0 turns it off.', low=0, high=10000, unit='pixels')
+        4, 'Window of the edge normalisation, before and after; 0 turns it off.', low=0, high=10000, unit='pixels')
     min_size: int = _parameter(5, 'Smaller line-blobs give no segment.', low=2, high=100000, unit='pixels')
     orientation: str = _parameter(
         'principal_axis', 'How the orientation of a line-blob is computed.',

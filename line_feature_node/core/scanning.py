@@ -25,29 +25,34 @@ STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 #: A mark of a pixel that belongs to a chain already, or fills a gap.
 TAKEN = 16
+#: The bits of a candidate that no chain has yet.
+CANDIDATE = CODE | STRONG
 #: The strong bit of eight marks at once.
 STRONG_WORD = np.uint64(STRONG * 0x0101010101010101)
+#: In place of a state: the chain ends.
+END = 255
 #: A chain turns by at most this many directions at once.
 SHARPEST = 2
 #: The direction of a chain at its end is measured over this many pixels.
 REACH = 4
 
 
-def _next_direction() -> NDArray[np.uint8]:
-    """Where a chain goes on: indexed by direction, sign of its last turn (0 left, 1 right) and mask of neighbours.
+def _next_state() -> NDArray[np.uint8]:
+    """Where a chain goes on, indexed by its state and the mask of its neighbours; END where it ends.
 
-    Bit d of the mask stands for an unvisited neighbour in direction d; 255 means that the chain ends.
+    A state is 2 (direction) + (whether the last turn was to the right). Bit d of the mask stands for an unvisited
+    neighbour in direction d.
     """
-    table = np.full((8, 2, 256), 255, np.uint8)
-    for direction in range(8):
-        for right in range(2):
-            back = -1 if right else 1
-            turns = [0, *(k * sign for k in range(1, SHARPEST + 1) for sign in (back, -back))]
-            for mask in range(256):
-                for turn in turns:
-                    if mask >> (direction + turn) % 8 & 1:
-                        table[direction, right, mask] = (direction + turn) % 8
-                        break
+    table = np.full((16, 256), END, np.uint8)
+    for state in range(16):
+        direction, right = divmod(state, 2)
+        back = -1 if right else 1
+        turns = [0, *(k * sign for k in range(1, SHARPEST + 1) for sign in (back, -back))]
+        for mask in range(256):
+            for turn in turns:
+                if mask >> (direction + turn) % 8 & 1:
+                    table[state, mask] = 2 * ((direction + turn) % 8) + (right if turn == 0 else turn > 0)
+                    break
     return table
 
 
@@ -73,7 +78,7 @@ def _fan(longest: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.array(steps), np.cumsum([0, *counts])
 
 
-NEXT_DIRECTION = _next_direction()
+NEXT_STATE = _next_state()
 FAN, FAN_OFFSETS = _fan(8)
 
 
@@ -113,7 +118,7 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
     most = int(np.count_nonzero(flat))
     raw_pixels, raw_codes = buffers.array('raw pixels', most, np.int32), buffers.array('raw codes', most, np.uint8)
     raw_offsets = buffers.array('raw offsets', most + 1, np.int32)
-    raw = trace(flat, flat.view(np.uint64), stride, NEXT_DIRECTION, raw_pixels, raw_codes, raw_offsets,
+    raw = trace(flat, flat.view(np.uint64), stride, NEXT_STATE, raw_pixels, raw_codes, raw_offsets,
                 buffers.array('stack', most, np.int32))
     links = buffers.array('links', 2 * raw, np.int32)
     link_gaps(flat, stride, raw, parameters.max_gap, FAN, FAN_OFFSETS, raw_pixels, raw_codes, raw_offsets,
@@ -130,9 +135,7 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
 
 
 @kernel
-def trace(
-    marks: Any, words: Any, stride: int, table: Any, pixels: Any, codes: Any, offsets: Any, stack: Any,
-) -> int:
+def trace(marks: Any, words: Any, stride: int, table: Any, pixels: Any, codes: Any, offsets: Any, stack: Any) -> int:
     """Visit all candidates that are connected to a strong one; return the number of chains that this made."""
     chains = 0
     length = 0
@@ -151,17 +154,11 @@ def trace(
                 beside = stack[top]
                 for direction in range(8):
                     start = beside + STEP_X[direction] + stride * STEP_Y[direction]
-                    if is_open(marks[start]):
+                    if marks[start] & CANDIDATE:
                         length, top = trace_chain(start, marks, stride, table, pixels, codes, length, stack, top)
                         chains += 1
                         offsets[chains] = length
     return chains
-
-
-@kernel
-def is_open(mark: int) -> bool:
-    """Whether a mark is that of a candidate that no chain has yet."""
-    return (mark != 0) & (mark != TAKEN)
 
 
 @kernel
@@ -196,22 +193,17 @@ def walk(
 ) -> tuple[int, int]:
     """Append the pixels that follow the start in a direction, and put those beside which others stay on the stack."""
     pixel = start
-    right = 0
+    state = 2 * direction
     while True:
         mask = open_neighbours(marks, pixel, stride)
-        if mask == 0:
-            break
-        following = table[direction, right, mask]
-        if pixel != start and (following == 255 or mask & (mask - 1) != 0):
+        following = table[state, mask]
+        if pixel != start and ((mask & (mask - 1)) != 0 or (following == END and mask != 0)):
             stack[top] = pixel
             top += 1
-        if following == 255:
+        if following == END:
             break
-        turn = (following - direction) % 8
-        if turn != 0:
-            right = 1 if turn < 4 else 0
-        direction = following
-        pixel += STEP_X[direction] + stride * STEP_Y[direction]
+        state = following
+        pixel += STEP_X[state // 2] + stride * STEP_Y[state // 2]
         pixels[length] = pixel
         codes[length] = marks[pixel] & CODE
         marks[pixel] = TAKEN
@@ -226,6 +218,12 @@ def open_neighbours(marks: Any, pixel: int, stride: int) -> int:
     return (is_open(marks[pixel + 1]) | is_open(marks[below + 1]) << 1 | is_open(marks[below]) << 2
             | is_open(marks[below - 1]) << 3 | is_open(marks[pixel - 1]) << 4 | is_open(marks[above - 1]) << 5
             | is_open(marks[above]) << 6 | is_open(marks[above + 1]) << 7)
+
+
+@kernel
+def is_open(mark: int) -> int:
+    """1 for the mark of a candidate that no chain has yet, 0 for any other."""
+    return np.int64((mark & CANDIDATE) != 0)
 
 
 @kernel
