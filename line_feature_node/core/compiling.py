@@ -14,7 +14,16 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     A product and a sum may be contracted to one instruction; no other liberty is taken with floats, so that NaN and
     the order of sums mean what they say.
     """
-    options = {'nogil': True, 'fastmath': {'contract'}, 'error_model': 'numpy'}
+    return _compile(function)
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As :func:`kernel`, for what is called once an end or a pixel: an array costs seven arguments in a real call."""
+    return _compile(function, forceinline=True)
+
+
+def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    options |= {'nogil': True, 'fastmath': {'contract'}, 'error_model': 'numpy'}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.compiling import kernel
+from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.parameters import Parameters
 from line_feature_node.core.vectors import LANES, TILE, load, multiply, multiply_add, store, transpose
 
@@ -133,7 +133,7 @@ def smooth_forward(image: Any, scale: float, offset: float, q: float, strip: Any
     start_upwards(last, plane[bottom], plane[bottom - 1], plane[bottom + 1], plane[bottom + 2], np.float32(q))
 
 
-@kernel
+@inlined
 def load_rows(image: Any, first: int, scale: Any, offset: Any, plane: Any) -> None:
     """Bring LANES rows of the image into the plane as grey levels, the last row standing in for those below it."""
     height, width = image.shape
@@ -144,7 +144,7 @@ def load_rows(image: Any, first: int, scale: Any, offset: Any, plane: Any) -> No
             target[column] = scale * np.float32(source[column]) + offset
 
 
-@kernel
+@inlined
 def turn(plane: Any, first: int, strip: Any) -> None:
     """Bring LANES rows of the plane into the strip."""
     rows, stride = plane.reshape(-1), plane.shape[1]
@@ -153,7 +153,7 @@ def turn(plane: Any, first: int, strip: Any) -> None:
             transpose(rows, (first + lane) * stride + column, stride, strip, column * LANES + lane, LANES)
 
 
-@kernel
+@inlined
 def turn_back(strip: Any, plane: Any, first: int) -> None:
     """Bring the strip into LANES rows of the plane."""
     rows, stride = plane.reshape(-1), plane.shape[1]
@@ -162,7 +162,7 @@ def turn_back(strip: Any, plane: Any, first: int) -> None:
             transpose(strip, column * LANES + lane, LANES, rows, (first + lane) * stride + column, stride)
 
 
-@kernel
+@inlined
 def smooth_strip(strip: Any, width: int, q: Any) -> None:
     """Smooth along x, all lanes at once: E * E as a causal and an anticausal pass over the replicated rows."""
     gain, first, second = (1 - q) * (1 - q), 2 * q, -q * q
@@ -206,7 +206,7 @@ def start_weights(q: Any, k: int) -> tuple[Any, Any, Any]:
     return np.float32(1 - of_u - of_u1), np.float32(of_u), np.float32(of_u1)
 
 
-@kernel
+@inlined
 def recur(y: Any, y1: Any, y2: Any, q: Any) -> None:
     """One step of y = (1 - q)^2 x + 2 q y1 - q^2 y2, elementwise, in place of x; response (n + 1) q^n, half of E * E."""
     gain, first, second = (1 - q) * (1 - q), 2 * q, -q * q
@@ -243,7 +243,7 @@ def sweep(
                      marks[row + MARGIN, MARGIN:MARGIN + width])
 
 
-@kernel
+@inlined
 def combine_columns(above: Any, middle: Any, below: Any, side: Any, centre: Any, across: Any, along: Any) -> None:
     """The vertical half of the 3x3 stencils: smoothed for the derivative across, differentiated for that along."""
     for i in range(middle.size):
@@ -251,7 +251,7 @@ def combine_columns(above: Any, middle: Any, below: Any, side: Any, centre: Any,
         along[i] = below[i] - above[i]
 
 
-@kernel
+@inlined
 def gradient(across: Any, along: Any, side: Any, centre: Any, gx: Any, gy: Any, norm: Any) -> None:
     """The horizontal half of the 3x3 stencils, and the norm of the gradient."""
     for i in range(1, across.size - 1):
@@ -262,7 +262,7 @@ def gradient(across: Any, along: Any, side: Any, centre: Any, gx: Any, gy: Any, 
         norm[i] = np.sqrt(x * x + y * y)
 
 
-@kernel
+@inlined
 def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2: Any, marks: Any) -> None:
     """Non-maximum suppression, thresholds and direction codes of one row.
 
@@ -295,7 +295,7 @@ def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2:
         marks[i] = code if maximum & (norm > T2) else NO_MARK
 
 
-@kernel
+@inlined
 def is_maximum(own: Any, forward: Any, backward: Any) -> bool:
     """Whether a norm is greater than the two beside it, or the first of two equal ones; but not within a ramp."""
     return ((forward <= (ONE + TIE) * own) & (backward < (ONE - TIE) * own)

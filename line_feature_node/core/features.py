@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from line_feature_node.core.blobs import Blobs
+from line_feature_node.core.blobs import Blobs, position
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.compiling import kernel
+from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.parameters import Parameters
 
 #: One segment, as users get it and as the PointCloud2 message lays it out. Pixels and radians; the centre of the
@@ -85,15 +85,16 @@ def fit_blobs(
     return count
 
 
-@kernel
+@inlined
 def sum_pixels(members: Any, pixels: Any, bridged: Any, stride: int, margin: int, line: Any) -> None:
     """The sums of (A.1) and (A.3); whole numbers, and so exact."""
+    inverse = 1 / stride
     n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
     for k in members:
         if bridged[k]:
             continue
-        row = pixels[k] // stride
-        x, y = pixels[k] - row * stride - margin, row - margin
+        row, column = position(pixels[k], inverse, stride)
+        x, y = column - margin, row - margin
         n += 1
         sx += x
         sy += y
@@ -104,7 +105,7 @@ def sum_pixels(members: Any, pixels: Any, bridged: Any, stride: int, margin: int
     line['sxx'], line['sxy'], line['syy'] = sxx, sxy, syy
 
 
-@kernel
+@inlined
 def fit(line: Any, least_squares: bool, height: float, width: float) -> bool:
     """Compute mid-point, direction and end points of a line from its sums; False when it has no direction."""
     n = line['n']
@@ -121,7 +122,7 @@ def fit(line: Any, least_squares: bool, height: float, width: float) -> bool:
     return True
 
 
-@kernel
+@inlined
 def principal_axis(mu20: float, mu11: float, mu02: float) -> tuple[float, float]:
     """Cosine and sine of theta = atan(2 mu11 / (mu20 - mu02)) / 2, equation (A.2); both 0 where all axes are equal.
 
@@ -140,7 +141,7 @@ def principal_axis(mu20: float, mu11: float, mu02: float) -> tuple[float, float]
     return rightward(mu11 / (r * sin), sin)
 
 
-@kernel
+@inlined
 def regression(mu20: float, mu11: float, mu02: float) -> tuple[float, float]:
     """Cosine and sine of the least-squares line: y on x, or x on y for a steep blob; both 0 as for the principal axis."""
     if mu11 == 0 and mu20 == mu02:
@@ -150,7 +151,7 @@ def regression(mu20: float, mu11: float, mu02: float) -> tuple[float, float]:
     return rightward(x / r, y / r)
 
 
-@kernel
+@inlined
 def rightward(cos: float, sin: float) -> tuple[float, float]:
     """The one of two opposite directions that points to the right; down where both are vertical."""
     if cos < 0:
@@ -160,7 +161,7 @@ def rightward(cos: float, sin: float) -> tuple[float, float]:
     return cos, sin
 
 
-@kernel
+@inlined
 def set_end_points(line: Any, height: float, width: float) -> None:
     """End points on the minimum rectangle, (A.5) and (A.6), clipped to the image along the line.
 
@@ -180,7 +181,7 @@ def set_end_points(line: Any, height: float, width: float) -> None:
     line['x2'], line['y2'] = x + last * cos, y + last * sin
 
 
-@kernel
+@inlined
 def clip(first: float, last: float, start: float, step: float, size: float) -> tuple[float, float]:
     """Shorten an interval of t so that start + t step stays within [-1/2, size - 1/2]."""
     if step == 0:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.compiling import kernel
+from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.features import fit
 from line_feature_node.core.parameters import Parameters
 
@@ -50,25 +50,25 @@ def link_lines(
         room *= 4
 
 
-@kernel
+@inlined
 def collinear(first: Any, second: Any, tau1: float) -> bool:
     """Definition 1: max(l1, l2) < tau1, with l1 and l2 from each mid-point to the other, infinite, line."""
     return max(distance(first, second), distance(second, first)) < tau1
 
 
-@kernel
+@inlined
 def distance(first: Any, second: Any) -> float:
     """Distance from the mid-point of one line to the infinite other."""
     return abs((first['y'] - second['y']) * second['cos'] - (first['x'] - second['x']) * second['sin'])
 
 
-@kernel
+@inlined
 def overlapped(first: Any, second: Any) -> bool:
     """Definition 2, either way round: the text does not say which of the two lines is L1."""
     return falls_on(first, second) or falls_on(second, first)
 
 
-@kernel
+@inlined
 def falls_on(first: Any, second: Any) -> bool:
     """Whether L3, orthogonal to the first line in its mid-point P1, meets the second in a point P3 of its rectangle.
 
@@ -92,7 +92,7 @@ def adjacent(first: Any, second: Any, tau2: float) -> bool:
     return nearest_ends(first, second)[0] < tau2
 
 
-@kernel
+@inlined
 def nearest_ends(first: Any, second: Any) -> tuple[float, int]:
     """The smallest distance between ends of two lines; and between which, as 2 (end of first) + (end of second)."""
     a = squared(first['x1'] - second['x1'], first['y1'] - second['y1'])
@@ -103,13 +103,13 @@ def nearest_ends(first: Any, second: Any) -> tuple[float, int]:
     return np.sqrt(gap), (0 if a == gap else (1 if b == gap else (2 if c == gap else 3)))
 
 
-@kernel
+@inlined
 def squared(x: float, y: float) -> float:
     """Square of a distance."""
     return x * x + y * y
 
 
-@kernel
+@inlined
 def merge(first: Any, second: Any, merged: Any, least_squares: bool, height: float, width: float) -> bool:
     """The line of the pixels of both: sums add, rectangles unite, the code is that of the larger part.
 
@@ -131,7 +131,7 @@ def merge(first: Any, second: Any, merged: Any, least_squares: bool, height: flo
     return fit(merged, least_squares, height, width)
 
 
-@kernel
+@inlined
 def precedes(first: Any, second: Any) -> int:
     """-1, 0 or 1 as the coordinates of the first line come before, equal or come after those of the second."""
     for a, b in (
@@ -143,7 +143,7 @@ def precedes(first: Any, second: Any) -> int:
     return 0
 
 
-@kernel
+@inlined
 def comes_first(a: int, b: int, lines: Any, pairs: Any, gaps: Any) -> bool:
     """Whether pair a is to be linked before pair b."""
     if gaps[a] != gaps[b]:
@@ -183,14 +183,14 @@ def pop(heap: Any, size: int, lines: Any, pairs: Any, gaps: Any) -> int:
     return first
 
 
-@kernel
+@inlined
 def cell_of(line: Any, end: int, cell: float) -> tuple[int, int]:
     """Row and column of the grid in which an end of a line lies."""
     x, y = (line['x1'], line['y1']) if end == 0 else (line['x2'], line['y2'])
     return int((y + 0.5) / cell), int((x + 0.5) / cell)
 
 
-@kernel
+@inlined
 def insert(k: int, lines: Any, cell: float, entries: Any, cells: Any) -> None:
     """Put both ends of a line into the grid."""
     for end in range(2):
@@ -199,7 +199,7 @@ def insert(k: int, lines: Any, cell: float, entries: Any, cells: Any) -> None:
         cells[row, column] = 2 * k + end
 
 
-@kernel
+@inlined
 def find_pairs(
     k: int, found: int, waiting: int, lines: Any, tau1: float, tau2: float, cell: float, alive: Any, entries: Any,
     cells: Any, pairs: Any, gaps: Any, heap: Any,

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from line_feature_node.core.compiling import kernel
+from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.scanning import Chains
 
 #: Counts of the four codes are kept in one number, 16 bits each; windows are cut to what 15 bits can count.
@@ -34,19 +34,19 @@ def normalize_chains(codes: Any, offsets: Any, closed: Any, n: int) -> None:
             normalize_open(codes[first:end], n)
 
 
-@kernel
+@inlined
 def one(code: int) -> int:
     """The counts of a single pixel."""
     return 1 << COUNT_BITS * (np.int64(code) - 1)
 
 
-@kernel
+@inlined
 def count(counts: int, code: int) -> int:
     """How many of the counted pixels have a code."""
     return counts >> COUNT_BITS * (np.int64(code) - 1) & COUNT_MASK
 
 
-@kernel
+@inlined
 def takes_code_before(before: int, after: int, size_before: int, size_after: int, old: int, new: int) -> bool:
     """Equation (5), whether Lambda > 1: the change from code old, d(k), to code new, d(k+1), is a perturbation.
 

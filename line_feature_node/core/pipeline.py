@@ -195,7 +195,7 @@ def _stages(kept: dict[str, Any], segments: NDArray[np.void], min_length: float)
     pixels = np.stack(np.divmod(chains.pixels, marks.shape[1])[::-1], -1) - MARGIN
     return Stages(
         grey=grey, candidates=candidates, strong=(marks & STRONG != 0)[inside],
-        edges=np.where(visited[inside] == TAKEN, candidates, 0).astype(np.uint8), chain_pixels=pixels,
+        edges=np.where(visited[inside] & TAKEN, candidates, 0).astype(np.uint8), chain_pixels=pixels,
         chain_offsets=chains.offsets, chain_directions=chains.directions, closed=chains.closed,
         bridged=chains.bridged, codes_before=chains.codes, codes_after=kept['normalization'],
         blobs=blobs.attributes, blob_pixels=pixels[blobs.members], blob_offsets=blobs.offsets,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.compiling import kernel
+from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.edges import CODE, STRONG
 from line_feature_node.core.parameters import Parameters
 
@@ -25,6 +25,8 @@ STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 #: A mark of a pixel that belongs to a chain already, or fills a gap.
 TAKEN = 16
+#: With TAKEN: a chain that may be linked ends here.
+ENDING = 32
 #: The bits of a candidate that no chain has yet.
 CANDIDATE = CODE | STRONG
 #: The strong bit of eight marks at once.
@@ -122,7 +124,7 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
                 buffers.array('stack', most, np.int32))
     links = buffers.array('links', 2 * raw, np.int32)
     link_gaps(flat, stride, raw, parameters.max_gap, FAN, FAN_OFFSETS, raw_pixels, raw_codes, raw_offsets,
-              buffers.array('ends', flat.size, np.int32, zeros=True), links)
+              buffers.array('ends', flat.size, np.int32), buffers.array('end directions', 2 * raw, np.uint8), links)
     most += parameters.max_gap * raw
     pixels, codes = buffers.array('pixels', most, np.int32), buffers.array('codes', most, np.uint8)
     directions, bridged = buffers.array('directions', most, np.uint8), buffers.array('bridged', most, np.bool_)
@@ -186,7 +188,7 @@ def trace_chain(
     return length, top
 
 
-@kernel
+@inlined
 def walk(
     start: int, direction: int, marks: Any, stride: int, table: Any, pixels: Any, codes: Any, length: int, stack: Any,
     top: int,
@@ -211,22 +213,26 @@ def walk(
     return length, top
 
 
-@kernel
+@inlined
 def open_neighbours(marks: Any, pixel: int, stride: int) -> int:
-    """The mask of a pixel: bit d is set where the neighbour in direction d is a candidate that no chain has yet."""
-    above, below = pixel - stride, pixel + stride
-    return (is_open(marks[pixel + 1]) | is_open(marks[below + 1]) << 1 | is_open(marks[below]) << 2
-            | is_open(marks[below - 1]) << 3 | is_open(marks[pixel - 1]) << 4 | is_open(marks[above - 1]) << 5
-            | is_open(marks[above]) << 6 | is_open(marks[above + 1]) << 7)
+    """The mask of a pixel: bit d is set where the neighbour in direction d is a candidate that no chain has yet.
+
+    Indices are unsigned, for which Numba leaves out the test whether to count from the end.
+    """
+    middle, row, one = np.uint64(pixel), np.uint64(stride), np.uint64(1)
+    above, below = middle - row, middle + row
+    return (is_open(marks[middle + one]) | is_open(marks[below + one]) << 1 | is_open(marks[below]) << 2
+            | is_open(marks[below - one]) << 3 | is_open(marks[middle - one]) << 4 | is_open(marks[above - one]) << 5
+            | is_open(marks[above]) << 6 | is_open(marks[above + one]) << 7)
 
 
-@kernel
+@inlined
 def is_open(mark: int) -> int:
     """1 for the mark of a candidate that no chain has yet, 0 for any other."""
     return np.int64((mark & CANDIDATE) != 0)
 
 
-@kernel
+@inlined
 def reverse(values: Any, first: int, end: int) -> None:
     """Turn round values[first:end] in place."""
     last = end - 1
@@ -239,7 +245,7 @@ def reverse(values: Any, first: int, end: int) -> None:
 @kernel
 def link_gaps(
     marks: Any, stride: int, chains: int, max_gap: int, fan: Any, fan_offsets: Any, pixels: Any, codes: Any,
-    offsets: Any, ends: Any, links: Any,
+    offsets: Any, ends: Any, directions: Any, links: Any,
 ) -> None:
     """Link the ends of chains over gaps of up to max_gap pixels, the shortest gaps first.
 
@@ -249,50 +255,64 @@ def link_gaps(
     """
     links[:2 * chains] = -1
     for end in range(2 * chains):
-        if offsets[end // 2 + 1] - offsets[end // 2] > 1:
-            ends[pixels[end_index(offsets, end)]] = end + 1
+        directions[end] = end_direction(pixels, offsets, end, stride)
+        if directions[end] != END:
+            pixel = pixels[end_index(offsets, end)]
+            ends[pixel] = end
+            marks[pixel] = TAKEN | ENDING
     for gap in range(max_gap + 1):
         for end in range(2 * chains):
-            chain = end // 2
-            if links[end] != -1 or offsets[chain + 1] - offsets[chain] < 2:
-                continue
-            index = end_index(offsets, end)
-            pixel = pixels[index]
-            column = pixel % stride
-            direction = end_direction(pixels, offsets, end, stride)
-            for k in range(fan_offsets[gap], fan_offsets[gap + 1]):
-                step_x, step_y = fan[direction, k, 0], fan[direction, k, 1]
-                target = pixel + step_x + step_y * stride
-                if not (0 <= column + step_x < stride and 0 <= target < ends.size):
-                    continue
-                other = ends[target] - 1
-                if other < 0 or other == end or links[other] != -1:
-                    continue
-                facing = (end_direction(pixels, offsets, other, stride) - direction + 4 + 1) % 8 <= 2
-                between = (codes[index] - codes[end_index(offsets, other)]) % 4
-                if facing and between != 2 and is_free(marks, pixel, target, gap, stride):
+            if links[end] == -1 and directions[end] != END:
+                other = facing_end(end, gap, marks, stride, fan, fan_offsets, pixels, codes, offsets, ends, directions,
+                                   links)
+                if other != -1:
                     links[end] = other
                     links[other] = end
-                    break
-    for end in range(2 * chains):
-        ends[pixels[end_index(offsets, end)]] = 0
 
 
-@kernel
+@inlined
+def facing_end(
+    end: int, gap: int, marks: Any, stride: int, fan: Any, fan_offsets: Any, pixels: Any, codes: Any, offsets: Any,
+    ends: Any, directions: Any, links: Any,
+) -> int:
+    """The end that one can be linked with over a gap, -1 if there is none; the pixels between are then taken."""
+    index = end_index(offsets, end)
+    pixel = np.int64(pixels[index])
+    direction = directions[end]
+    for k in range(fan_offsets[gap], fan_offsets[gap + 1]):
+        target = pixel + fan[direction, k, 0] + fan[direction, k, 1] * stride
+        if not (0 <= target < marks.size and marks[target] & ENDING):
+            continue
+        other = ends[target]
+        # A step over the margin leads to the other side of the image.
+        if other == end or links[other] != -1 or abs(target % stride - pixel % stride) > gap + 1:
+            continue
+        facing = (directions[other] - direction + 4 + 1) % 8 <= 2
+        between = (np.int64(codes[index]) - codes[end_index(offsets, other)]) % 4
+        if facing and between != 2 and take_gap(marks, pixel, target, gap, stride):
+            return other
+    return -1
+
+
+@inlined
 def end_index(offsets: Any, end: int) -> int:
     """Where the pixel of an end stands."""
     return offsets[end // 2] if end % 2 == 0 else offsets[end // 2 + 1] - 1
 
 
-@kernel
+@inlined
 def end_direction(pixels: Any, offsets: Any, end: int, stride: int) -> int:
-    """The chain-code direction in which a chain of two pixels or more leaves over one of its ends."""
+    """The chain-code direction in which a chain leaves over one of its ends; END for a chain of one pixel."""
     chain = end // 2
-    index = end_index(offsets, end)
     reach = min(REACH, offsets[chain + 1] - offsets[chain] - 1)
+    if reach == 0:
+        return END
+    index = end_index(offsets, end)
     inner = pixels[index + reach if end % 2 == 0 else index - reach]
-    x = pixels[index] % stride - inner % stride
-    y = pixels[index] // stride - inner // stride
+    step = np.int64(pixels[index]) - inner
+    # A step of up to REACH pixels, as rows and columns: rounded to whole rows, what is left is columns.
+    y = (step + stride // 2) // stride
+    x = step - y * stride
     # 2 : 5 stands for tan 22.5 degrees, which no pair of steps up to REACH can tell from it.
     if 5 * abs(y) < 2 * abs(x):
         return 0 if x > 0 else 4
@@ -303,7 +323,7 @@ def end_direction(pixels: Any, offsets: Any, end: int, stride: int) -> int:
     return 7 if x > 0 else 5
 
 
-@kernel
+@inlined
 def gap_pixel(pixel: int, target: int, k: int, gap: int, stride: int) -> int:
     """The k-th of the `gap` pixels on the digital straight line between two pixels; 0 is the pixel itself."""
     x, y = pixel % stride, pixel // stride
@@ -312,9 +332,9 @@ def gap_pixel(pixel: int, target: int, k: int, gap: int, stride: int) -> int:
     return (x + (2 * span_x * k + steps) // (2 * steps)) + (y + (2 * span_y * k + steps) // (2 * steps)) * stride
 
 
-@kernel
-def is_free(marks: Any, pixel: int, target: int, gap: int, stride: int) -> bool:
-    """Whether the pixels between two ends belong to nothing; if so, they are taken."""
+@inlined
+def take_gap(marks: Any, pixel: int, target: int, gap: int, stride: int) -> bool:
+    """Take the pixels between two ends; False if one of them is an edge, or taken already."""
     for k in range(1, gap + 1):
         if marks[gap_pixel(pixel, target, k, gap, stride)] != 0:
             return False
@@ -370,21 +390,24 @@ def first_end(chain: int, links: Any) -> int:
     return end
 
 
-@kernel
+@inlined
 def append(
     end: int, raw_pixels: Any, raw_codes: Any, raw_offsets: Any, pixels: Any, codes: Any, bridged: Any, length: int,
 ) -> int:
     """Copy a raw chain, beginning with the given end of it."""
     first, last = raw_offsets[end // 2], raw_offsets[end // 2 + 1]
-    for k in range(last - first):
-        source = first + k if end % 2 == 0 else last - 1 - k
-        pixels[length + k] = raw_pixels[source]
-        codes[length + k] = raw_codes[source]
-        bridged[length + k] = False
-    return length + last - first
+    total = length + last - first
+    bridged[length:total] = False
+    if end % 2 == 0:
+        pixels[length:total] = raw_pixels[first:last]
+        codes[length:total] = raw_codes[first:last]
+    else:
+        pixels[length:total] = raw_pixels[first:last][::-1]
+        codes[length:total] = raw_codes[first:last][::-1]
+    return total
 
 
-@kernel
+@inlined
 def bridge(target: int, stride: int, pixels: Any, codes: Any, bridged: Any, length: int) -> int:
     """Fill the gap between the last pixel and the target with a digital straight line of the last pixel's code."""
     pixel, code = pixels[length - 1], codes[length - 1]
@@ -397,21 +420,26 @@ def bridge(target: int, stride: int, pixels: Any, codes: Any, bridged: Any, leng
     return length
 
 
-@kernel
+@inlined
 def are_neighbours(a: int, b: int, stride: int) -> bool:
     """Whether two different pixels touch."""
     step = abs(a - b)
     return step == 1 or (stride - 1 <= step <= stride + 1)
 
 
-@kernel
+@inlined
 def chain_codes(pixels: Any, first: int, end: int, closed: bool, stride: int, directions: Any) -> None:
     """Write the direction from each pixel of a chain to the next."""
-    for k in range(first, end):
-        if k + 1 == end and not closed:
-            directions[k] = 255
-            break
-        step = pixels[k + 1 if k + 1 < end else first] - pixels[k]
-        down = (step > 1) - (step < -1)
-        right = step - down * stride
-        directions[k] = (2 - right if down == 1 else 6 + right) if down != 0 else (0 if right == 1 else 4)
+    for k in range(first, end - 1):
+        directions[k] = chain_code(pixels[k + 1] - pixels[k], np.int32(stride))
+    directions[end - 1] = chain_code(pixels[first] - pixels[end - 1], np.int32(stride)) if closed else END
+
+
+@inlined
+def chain_code(step: int, stride: int) -> int:
+    """The direction of a step between neighbours, given as a difference of flat indices."""
+    down = np.int32(step > 1) - np.int32(step < -1)
+    right = step - down * stride
+    level = np.int32(0) if right == 1 else np.int32(4)
+    upward = np.int32(6) + right
+    return np.uint8((np.int32(2) - right if down == 1 else upward) if down != 0 else level)
