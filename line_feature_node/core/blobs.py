@@ -124,8 +124,11 @@ def collect(
 
 
 @inlined
-def position(pixel: int, inverse: float, stride: int) -> tuple[int, int]:
-    """Row and column of a flat index. Half a pixel keeps the product, which replaces a slow division, off whole rows."""
+def position(pixel: int, inverse: float, stride: int) -> tuple[Any, Any]:
+    """Row and column of a flat index.
+
+    The product replaces a slow division; half a pixel keeps it off whole numbers, where rounding would matter.
+    """
     row = np.int64((pixel + 0.5) * inverse)
     return row, pixel - row * stride
 

@@ -56,16 +56,17 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     """
     height, width = image.shape
     # Whole strips of rows and whole tiles of columns fit in, with the padding.
-    plane = buffers.image('plane', -(-height // LANES) * LANES + 2 * PAD, -(-(width + 2 * PAD) // TILE) * TILE, np.float32)
-    rows = buffers.image('rows', 12, plane.shape[1], np.float32)
+    lines, columns = -(-height // LANES) * LANES, -(-(width + 2 * PAD) // TILE) * TILE
+    plane = buffers.image('plane', lines + 2 * PAD, columns, np.float32)
+    rows = buffers.image('rows', 12, columns, np.float32)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     scale, offset = intensity_map(image.dtype, parameters)
     q = math.exp(-parameters.alpha)
     recursive = parameters.operator == 'deriche'
     if recursive:
         side, centre = deriche_stencil(parameters.alpha)
-        strip = buffers.array('strip', plane.shape[1] * LANES, np.float32)
-        smooth_forward(image, scale, offset, q, strip, plane, rows[0])
+        strip = buffers.array('strip', columns * LANES, np.float32)
+        smooth_forward(image, scale, offset + PEDESTAL, q, strip, plane, rows[0])
     else:
         side, centre = STENCILS[parameters.operator]
         copy_replicated(image, scale, offset, plane)
@@ -80,7 +81,7 @@ def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float
     if math.isnan(high):
         high = float(np.iinfo(dtype).max) if dtype.kind == 'u' else 255.0
     scale = 255.0 / (high - low)
-    return scale, PEDESTAL - scale * low
+    return scale, -scale * low
 
 
 #: The 3x3 operators as side and centre of their smoothing; derivative and smoothing together have unit gain on a ramp.
@@ -208,7 +209,7 @@ def start_weights(q: Any, k: int) -> tuple[Any, Any, Any]:
 
 @inlined
 def recur(y: Any, y1: Any, y2: Any, q: Any) -> None:
-    """One step of y = (1 - q)^2 x + 2 q y1 - q^2 y2, elementwise, in place of x; response (n + 1) q^n, half of E * E."""
+    """One step of y = (1 - q)^2 x + 2 q y1 - q^2 y2, elementwise and in place of x: (n + 1) q^n, half of E * E."""
     gain, first, second = (1 - q) * (1 - q), 2 * q, -q * q
     for i in range(y.size):
         y[i] = first * y1[i] + (second * y2[i] + gain * y[i])
@@ -229,15 +230,15 @@ def sweep(
     plane: Any, rows: Any, marks: Any,
 ) -> None:
     """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it."""
-    side, centre = np.float32(side), np.float32(centre)
+    b, a = np.float32(side), np.float32(centre)
     across, along = rows[0], rows[1]
     gx, gy, norm = rows[3:6], rows[6:9], rows[9:12]
     for row in range(height + PAD - 1, -1, -1):
         if recursive:
             recur(plane[row], plane[row + 1], plane[row + 2], np.float32(q))
         below, middle, above = (row + 3) % 3, (row + 2) % 3, (row + 1) % 3
-        combine_columns(plane[row], plane[row + 1], plane[row + 2], side, centre, across, along)
-        gradient(across, along, side, centre, gx[above], gy[above], norm[above])
+        combine_columns(plane[row], plane[row + 1], plane[row + 2], b, a, across, along)
+        gradient(across, along, b, a, gx[above], gy[above], norm[above])
         if row < height:
             suppress(norm[above], norm[middle], norm[below], gx[middle], gy[middle], np.float32(T1), np.float32(T2),
                      marks[row + MARGIN, MARGIN:MARGIN + width])

@@ -143,7 +143,7 @@ def principal_axis(mu20: float, mu11: float, mu02: float) -> tuple[float, float]
 
 @inlined
 def regression(mu20: float, mu11: float, mu02: float) -> tuple[float, float]:
-    """Cosine and sine of the least-squares line: y on x, or x on y for a steep blob; both 0 as for the principal axis."""
+    """Cosine and sine of the least-squares line: y on x, or x on y where that is steep; both 0 for equal axes."""
     if mu11 == 0 and mu20 == mu02:
         return 0.0, 0.0
     x, y = (mu20, mu11) if mu20 >= mu02 else (mu11, mu02)

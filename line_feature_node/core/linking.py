@@ -17,7 +17,7 @@ PARALLEL = 1e-9
 
 
 def link_lines(
-    lines: NDArray[np.void], count: int, height: int, width: int, parameters: Parameters, buffers: Buffers,
+    lines: NDArray[np.void], count: int, shape: tuple[int, int], parameters: Parameters, buffers: Buffers,
 ) -> NDArray[np.bool_]:
     """Link lines until no two can be linked any more.
 
@@ -27,13 +27,14 @@ def link_lines(
     Args:
         lines: LINE_DTYPE, with room for twice as many as there are; merged lines are appended.
         count: How many there are.
-        height, width: Size of the image.
+        shape: Height and width of the image.
         parameters: tau1, tau2 and orientation are used.
         buffers: Memory to work in.
 
     Returns:
         For each line, the appended ones included, whether it is left: a merged one's parts are not.
     """
+    height, width = shape
     cell = max(parameters.tau2, SMALLEST_CELL)
     rows, columns = int(height / cell) + 1, int(width / cell) + 1
     alive = buffers.array('alive', 2 * count, np.bool_)
@@ -99,7 +100,7 @@ def nearest_ends(first: Any, second: Any) -> tuple[float, int]:
     b = squared(first['x1'] - second['x2'], first['y1'] - second['y2'])
     c = squared(first['x2'] - second['x1'], first['y2'] - second['y1'])
     d = squared(first['x2'] - second['x2'], first['y2'] - second['y2'])
-    gap = min(min(a, b), min(c, d))
+    gap = min(a, b, c, d)
     return np.sqrt(gap), (0 if a == gap else (1 if b == gap else (2 if c == gap else 3)))
 
 

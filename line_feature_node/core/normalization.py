@@ -35,13 +35,13 @@ def normalize_chains(codes: Any, offsets: Any, closed: Any, n: int) -> None:
 
 
 @inlined
-def one(code: int) -> int:
+def one(code: int) -> Any:
     """The counts of a single pixel."""
     return 1 << COUNT_BITS * (np.int64(code) - 1)
 
 
 @inlined
-def count(counts: int, code: int) -> int:
+def count(counts: int, code: int) -> Any:
     """How many of the counted pixels have a code."""
     return counts >> COUNT_BITS * (np.int64(code) - 1) & COUNT_MASK
 

@@ -145,10 +145,10 @@ def _checked(field: 'dataclasses.Field[Any]', value: Any) -> Any:
             raise ValueError(f'{expected} one of {spec.range}, got {value!r}')
         return value
     whole = isinstance(field.default, int)
-    kind = numbers.Integral if whole else numbers.Real
-    if not isinstance(value, kind) or isinstance(value, bool):
+    if not isinstance(value, numbers.Integral if whole else numbers.Real) or isinstance(value, bool):
         raise TypeError(f'{expected} {"a whole number" if whole else "a number"} of {spec.range}'
                         f'{spec.unit and " " + spec.unit}, got {value!r}')
-    if not (spec.low <= value <= spec.high or (spec.unset and math.isnan(value))):
+    number: Any = value
+    if not (spec.low <= number <= spec.high or (spec.unset and math.isnan(number))):
         raise ValueError(f'{expected} {spec.range}{spec.unit and " " + spec.unit}, got {value!r}')
-    return int(value) if whole else float(value)
+    return int(number) if whole else float(number)

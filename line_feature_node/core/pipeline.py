@@ -116,6 +116,15 @@ class LineFeatureExtractor:
 
         return self._run(image, lap)
 
+    def warm_up(self, *types: Any) -> None:
+        """Compile the kernels, or load them from the cache, so that the first frame takes no longer than others.
+
+        Args:
+            *types: Types of pixels to expect; without, uint8, uint16 and float32.
+        """
+        for kind in types or PIXEL_TYPES:
+            self.extract(np.zeros((16, 16), kind))
+
     def stages(self, image: NDArray[Any]) -> Stages:
         """Extract, and keep what every step made; arguments and errors as for :meth:`extract`."""
         kept: dict[str, Any] = {}
@@ -143,7 +152,7 @@ class LineFeatureExtractor:
                                      buffers)
         watch('features', lines[:count])
         self.unlinked = count
-        alive = link_lines(lines, count, *grey.shape, p, buffers)
+        alive = link_lines(lines, count, grey.shape, p, buffers)
         segments = segments_of(lines, alive, p.min_length)
         watch('linking', segments)
         return segments
@@ -176,7 +185,7 @@ def _check(image: Any) -> None:
     """Raise what is wrong with an image."""
     if not isinstance(image, np.ndarray):
         raise TypeError(f'image must be a numpy array, got {type(image).__name__}')
-    if image.dtype not in [np.dtype(kind).newbyteorder(order) for kind in PIXEL_TYPES for order in '<>']:
+    if image.dtype.newbyteorder('=') not in PIXEL_TYPES:
         raise TypeError(f'image must be uint8, uint16 or float32, got {image.dtype}')
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))):
         raise ValueError(f'image must be H×W (grey), H×W×3 (BGR) or H×W×4 (BGRA), got shape {image.shape}')

@@ -227,7 +227,7 @@ def open_neighbours(marks: Any, pixel: int, stride: int) -> int:
 
 
 @inlined
-def is_open(mark: int) -> int:
+def is_open(mark: int) -> Any:
     """1 for the mark of a candidate that no chain has yet, 0 for any other."""
     return np.int64((mark & CANDIDATE) != 0)
 
@@ -436,7 +436,7 @@ def chain_codes(pixels: Any, first: int, end: int, closed: bool, stride: int, di
 
 
 @inlined
-def chain_code(step: int, stride: int) -> int:
+def chain_code(step: Any, stride: Any) -> Any:
     """The direction of a step between neighbours, given as a difference of flat indices."""
     down = np.int32(step > 1) - np.int32(step < -1)
     right = step - down * stride

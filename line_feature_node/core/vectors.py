@@ -11,7 +11,6 @@ against the other, and the twin runs under NUMBA_DISABLE_JIT.
 
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba import config, types
 from numba.extending import intrinsic, models, register_model
@@ -21,6 +20,7 @@ LANES = 32
 #: Width and height of the tiles that are transposed.
 TILE = 16
 
+_PLAIN = bool(vars(config)['DISABLE_JIT'])
 _LANES = ir.VectorType(ir.FloatType(), LANES)
 _ROW = ir.VectorType(ir.FloatType(), TILE)
 
@@ -52,10 +52,10 @@ def load_plain(array: Any, index: int) -> Any:
     return array[index:index + LANES].copy()
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _load(typing: Any, array: Any, index: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.load(_pointer(context, builder, signature.args[0], *arguments, _LANES), align=4)
+        return builder.load(_pointer(context, builder, signature.args[0], arguments[0], arguments[1], _LANES), align=4)
 
     return _vector(array, types.intp), generate
 
@@ -65,7 +65,7 @@ def store_plain(array: Any, index: int, vector: Any) -> None:
     array[index:index + LANES] = vector
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _store(typing: Any, array: Any, index: Any, vector: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target = _pointer(context, builder, signature.args[0], arguments[0], arguments[1], _LANES)
@@ -76,11 +76,11 @@ def _store(typing: Any, array: Any, index: Any, vector: Any) -> Any:
 
 
 def multiply_add_plain(factor: Any, vector: Any, summand: Any) -> Any:
-    """factor * vector + summand, with a number and two vectors; the processor may round once or twice."""
+    """A number times a vector plus a vector; the processor may round once or twice."""
     return factor * vector + summand
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _multiply_add(typing: Any, factor: Any, vector: Any, summand: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.fadd(_scaled(builder, *arguments[:2]), arguments[2], flags=('contract',))
@@ -89,11 +89,11 @@ def _multiply_add(typing: Any, factor: Any, vector: Any, summand: Any) -> Any:
 
 
 def multiply_plain(factor: Any, vector: Any) -> Any:
-    """factor * vector, with a number and a vector."""
+    """A number times a vector."""
     return factor * vector
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _multiply(typing: Any, factor: Any, vector: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _scaled(builder, *arguments)
@@ -120,7 +120,7 @@ def transpose_plain(source: Any, start: int, step: int, target: Any, target_star
             target[target_start + column * target_step + row] = source[start + row * step + column]
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def _transpose(
     typing: Any, source: Any, start: Any, step: Any, target: Any, target_start: Any, target_step: Any,
 ) -> Any:
@@ -155,8 +155,8 @@ def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
     return rows
 
 
-load: Any = load_plain if config.DISABLE_JIT else _load
-store: Any = store_plain if config.DISABLE_JIT else _store
-multiply: Any = multiply_plain if config.DISABLE_JIT else _multiply
-multiply_add: Any = multiply_add_plain if config.DISABLE_JIT else _multiply_add
-transpose: Any = transpose_plain if config.DISABLE_JIT else _transpose
+load: Any = load_plain if _PLAIN else _load
+store: Any = store_plain if _PLAIN else _store
+multiply: Any = multiply_plain if _PLAIN else _multiply
+multiply_add: Any = multiply_add_plain if _PLAIN else _multiply_add
+transpose: Any = transpose_plain if _PLAIN else _transpose

@@ -1,0 +1,154 @@
+"""The command `line_features`."""
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import cv2
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from line_feature_node import files, scenes, truth
+from line_feature_node.core import PROFILES, STEPS, Parameters
+
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
+    help='Line segments from images, after "Extraction of line features in a noisy image" (1997).')
+_console, _errors = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False, soft_wrap=True)
+
+#: The edges that a direction code stands for: its section of the gradient, and what lies across it.
+SECTIONS = {1: 'vertical', 2: 'rising', 3: 'horizontal', 4: 'falling'}
+
+Out = Annotated[Path, typer.Option(help='Folder for the overlays and tables.')]
+
+
+def _with_parameters(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command, which takes `parameters`, an option for `profile` and for each of Parameters instead."""
+
+    def run(profile: str, **values: Any) -> None:
+        own = {name: values.pop(name) for name in kept}
+        try:
+            parameters = Parameters.profile(profile, **{k: v for k, v in values.items() if v is not None})
+        except (TypeError, ValueError) as error:
+            raise typer.BadParameter(str(error)) from None
+        command(**own, parameters=parameters)
+
+    signature = inspect.signature(command)
+    kept = [name for name in signature.parameters if name != 'parameters']
+    options: dict[str, tuple[type, str | None, str]] = {
+        'profile': (str, 'default', f'Set of parameters to start from: {", ".join(PROFILES)}.')}
+    for name, spec in Parameters.specs().items():
+        unit = f' {spec.unit}' if spec.unit else ''
+        default = getattr(Parameters(), name)
+        options[name] = (type(default), None, f'{spec.description} {spec.range}{unit}; default {default}.')
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=typer.Option(default, f'--{name}', help=text),
+                          annotation=kind if default is not None else kind | None)
+        for name, (kind, default, text) in options.items()]
+    described = [*(signature.parameters[name] for name in kept), *added]
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    run.__signature__ = signature.replace(parameters=described)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in described}
+    return run
+
+
+@app.command()
+@_with_parameters
+def image(
+    paths: Annotated[list[Path], typer.Argument(metavar='PATH', help='Image files, or folders of them.')],
+    parameters: Parameters,
+    out: Out = Path('line_features'),
+) -> None:
+    """Extract the segments of image files: an overlay picture (PNG) and a table (CSV) of each.
+
+    Ends with status 0 when all went well, 1 when some files failed and 2 when all did.
+    """
+    found = files.find_images(paths)
+    if not found:
+        _fail(f'no image files in {", ".join(map(str, paths))}')
+    outcomes = _process(found, out, parameters)
+    done = [outcome for outcome in outcomes if not outcome.error]
+    if done:
+        _console.print(_table_of_steps(done))
+        _console.print(f'{len(done)} of {len(outcomes)} files done; overlays and tables are in {out}')
+    raise typer.Exit(0 if len(done) == len(outcomes) else 1 if done else 2)
+
+
+def _process(paths: list[Path], out: Path, parameters: Parameters) -> list[files.Outcome]:
+    """Process files with a progress bar on a terminal, a line for each, and errors on standard error."""
+    outcomes = []
+    try:
+        with Progress(console=_console, transient=True, disable=not _console.is_terminal) as progress:
+            for outcome in progress.track(files.process(paths, out, parameters), total=len(paths), description=''):
+                outcomes.append(outcome)
+                if outcome.error:
+                    _errors.print(f'{outcome.path}: {outcome.error}', markup=False)
+                else:
+                    _console.print(_line_of(outcome), markup=False)
+    except OSError as error:
+        _fail(f'cannot write to {out}: {error.strerror}')
+    return outcomes
+
+
+def _line_of(outcome: files.Outcome) -> str:
+    linked = 0 if outcome.segments is None else len(outcome.segments)
+    return (f'{outcome.path}: {outcome.width}×{outcome.height}, {outcome.unlinked} segments, {linked} after linking, '
+            f'{sum(outcome.times.values()) * 1e3:.1f} ms')
+
+
+def _table_of_steps(outcomes: list[files.Outcome]) -> Table:
+    table = Table('step', 'ms' if len(outcomes) == 1 else 'ms (median)')
+    table.columns[1].justify = 'right'
+    for step in STEPS:
+        table.add_row(step, f'{np.median([outcome.times[step] for outcome in outcomes]) * 1e3:.2f}')
+    table.add_section()
+    table.add_row('all', f'{np.median([sum(outcome.times.values()) for outcome in outcomes]) * 1e3:.2f}')
+    return table
+
+
+@app.command()
+@_with_parameters
+def demo(parameters: Parameters, out: Out = Path('demo')) -> None:
+    """Render a corridor as a robot's camera sees it, extract its segments and hold them against the truth."""
+    scene = scenes.corridor()
+    picture = out / 'corridor.png'
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        picture.write_bytes(cv2.imencode('.png', scene.image)[1].tobytes())
+    except OSError as error:
+        _fail(f'cannot write to {out}: {error.strerror}')
+    [outcome] = _process([picture], out, parameters)
+    if outcome.segments is None:
+        _fail(outcome.error)
+    _console.print(_table_of_steps([outcome]), _table_of_segments(outcome.segments))
+    ends = np.stack([outcome.segments[name] for name in ('x1', 'y1', 'x2', 'y2')], -1).astype(float)
+    agreement = truth.compare(ends, scene.truth, scene.weak)
+    _console.print(f'against the ground truth: precision {agreement.precision:.2f}, recall {agreement.recall:.2f}, '
+                   f'orientation within {np.degrees(agreement.angle):.2f}° and position within '
+                   f'{agreement.offset:.2f} px (medians)')
+    _console.print(f'table:   {outcome.table}\noverlay: {outcome.overlay}', markup=False)
+
+
+def _table_of_segments(segments: Any) -> Table:
+    table = Table('code', 'edges', 'segments', 'total length', 'longest')
+    for column in table.columns[2:]:
+        column.justify = 'right'
+    for code, name in SECTIONS.items():
+        length = segments['length'][segments['code'] == code]
+        table.add_row(str(code), name, str(length.size), f'{length.sum():.0f} px', f'{length.max(initial=0):.0f} px')
+    return table
+
+
+def _fail(message: str) -> NoReturn:
+    """End with one sentence and status 2."""
+    _errors.print(message, markup=False)
+    raise typer.Exit(2)
+
+
+def main() -> None:
+    """Run the command."""
+    app()

@@ -1,0 +1,53 @@
+"""Segments drawn over the image in which they were found."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+#: Colours (BGR) of the direction codes 1 to 4, told apart by colour-blind eyes too (after Okabe and Ito).
+COLOURS = {1: (0, 94, 213), 2: (115, 158, 0), 3: (233, 180, 86), 4: (66, 228, 240)}
+#: Brightness that is left of the picture, so that the segments stand out.
+BACKGROUND = 0.7
+#: Bits behind the binary point of the coordinates that OpenCV draws.
+SHIFT = 4
+
+
+def draw_overlay(image: NDArray[Any], segments: NDArray[np.void], caption: str = '') -> NDArray[np.uint8]:
+    """Draw segments, coloured by direction code and with their end points, over a darkened grey picture.
+
+    Args:
+        image: H×W, H×W×3 (BGR) or H×W×4 (BGRA), uint8.
+        segments: SEGMENT_DTYPE.
+        caption: A line of text for the top left corner.
+
+    Returns:
+        H×W×3 uint8, BGR; a new array.
+    """
+    canvas = np.asarray(cv2.convertScaleAbs(_bgr_of_grey(image), alpha=BACKGROUND), np.uint8)
+    ends = np.stack([segments[name] for name in ('x1', 'y1', 'x2', 'y2')], -1).astype(float)
+    thickness = max(1, round(max(canvas.shape[:2]) / 900))
+    points = np.round(ends * 2**SHIFT).astype(int)
+    for (x1, y1, x2, y2), code in zip(points.tolist(), segments['code'].tolist(), strict=True):
+        cv2.line(canvas, (x1, y1), (x2, y2), COLOURS[code], thickness, cv2.LINE_AA, SHIFT)
+    for x1, y1, x2, y2 in points.tolist():
+        for end in ((x1, y1), (x2, y2)):
+            cv2.circle(canvas, end, round((thickness + 0.5) * 2**SHIFT), (255, 255, 255), -1, cv2.LINE_AA, SHIFT)
+    if caption:
+        _write(canvas, caption)
+    return canvas
+
+
+def _bgr_of_grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+    if image.ndim == 3 and image.shape[2] > 1:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+
+
+def _write(canvas: NDArray[np.uint8], caption: str) -> None:
+    """A caption in white on black, so that it can be read on any picture."""
+    scale = max(0.4, max(canvas.shape[:2]) / 1400)
+    (width, height), base = cv2.getTextSize(caption, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    cv2.rectangle(canvas, (0, 0), (width + 8, height + base + 6), (0, 0, 0), -1)
+    cv2.putText(canvas, caption, (4, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)

@@ -1,0 +1,38 @@
+"""The package for colcon and pip; what package.xml says is taken from there."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from setuptools import find_packages, setup
+
+PACKAGE = ElementTree.parse(Path(__file__).parent / 'package.xml').getroot()
+NAME = PACKAGE.findtext('name')
+
+setup(
+    name=NAME,
+    version=PACKAGE.findtext('version'),
+    description=' '.join(PACKAGE.findtext('description').split()),
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    license=PACKAGE.findtext('license'),
+    maintainer=PACKAGE.findtext('maintainer'),
+    maintainer_email=PACKAGE.find('maintainer').get('email'),
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+    ],
+    zip_safe=False,
+    python_requires='>=3.10',
+    install_requires=[
+        'numba>=0.59', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'typer>=0.12',
+    ],
+    extras_require={
+        # rclpy's wheel needs the extra to find a middleware.
+        'ros': ['ros-jazzy-common-interfaces>=5.3', 'ros-jazzy-rclpy[fastrtps]>=7.1'],
+        'test': ['catkin_pkg>=1.0', 'hypothesis>=6.100', 'pytest>=8', 'pytest-xdist>=3.5'],
+        'lint': ['mypy>=1.11', 'ruff>=0.6'],
+    },
+    entry_points={'console_scripts': ['line_features = line_feature_node.cli:main']},
+)
