@@ -41,9 +41,7 @@ def compare(
         weak: K×4, true segments too faint or too short to ask for: what matches only these is not counted.
     """
     matched, low, high, offset, angle = _match(segments, truth)
-    counted = matched.any(1)
-    if weak is not None:
-        counted |= ~_match(segments, weak)[0].any(1)
+    counted = matched.any(1) | (True if weak is None else ~_match(segments, weak)[0].any(1))
     shared = np.where(matched, high - low, 0.0)
     length, true_length = _lengths(segments), _lengths(truth)
     covered = sum(_union(low[matched[:, j], j], high[matched[:, j], j]) for j in range(len(truth)))

@@ -29,8 +29,9 @@ STRONG = 8
 PAD, MARGIN = 2, 1
 #: Pixels whose norms differ by less than this part count as equal, so that a ramp has no edge in its interior.
 FLAT = np.float32(1e-3)
-#: Norms that differ by less than this part are a tie, which the first along the gradient wins: far above rounding.
-TIE = np.float32(2e-5)
+#: Norms that differ by less than this part, or this much, are a tie, which the first along the gradient wins: above
+#: rounding, which is relative to the norm in the stencils and to the grey levels, a few hundred, in the recursions.
+TIE, ROUNDING = np.float32(2e-5), np.float32(1e-4)
 ONE = np.float32(1)
 #: Marks as single bytes, so that a row of them is computed as bytes.
 NO_MARK, CODE_1, CODE_2, CODE_3, CODE_4, STRONG_MARK = (np.uint8(mark) for mark in (0, 1, 2, 3, 4, STRONG))
@@ -282,11 +283,11 @@ def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2:
         north, south, east, west = above[j], below[j], middle[j + 1], middle[j - 1]
         northeast, northwest, southeast, southwest = above[j + 1], above[j - 1], below[j + 1], below[j - 1]
         norm = middle[j]
-        own = norm * (ahead + aside)
+        across = ahead + aside
         # Both answers are computed: to select among the neighbours first would make gather instructions of the loads.
-        flat_maximum = is_maximum(own, ahead * east + aside * (southeast if same else northeast),
+        flat_maximum = is_maximum(norm, across, ahead * east + aside * (southeast if same else northeast),
                                   ahead * west + aside * (northwest if same else southwest))
-        steep_maximum = is_maximum(own, ahead * south + aside * (southeast if same else southwest),
+        steep_maximum = is_maximum(norm, across, ahead * south + aside * (southeast if same else southwest),
                                    ahead * north + aside * (northwest if same else northeast))
         maximum = (steep & steep_maximum) | ((not steep) & flat_maximum)
         code = CODE_2 if same else CODE_4
@@ -297,7 +298,11 @@ def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2:
 
 
 @inlined
-def is_maximum(own: Any, forward: Any, backward: Any) -> bool:
-    """Whether a norm is greater than the two beside it, or the first of two equal ones; but not within a ramp."""
-    return ((forward <= (ONE + TIE) * own) & (backward < (ONE - TIE) * own)
-            & ((forward < (ONE - FLAT) * own) | (backward < (ONE - FLAT) * own)))
+def is_maximum(norm: Any, across: Any, forward: Any, backward: Any) -> bool:
+    """Whether a norm is greater than the two beside it, or the first of two equal ones; but not within a ramp.
+
+    The norms forward and backward come multiplied by `across`.
+    """
+    flat = (ONE - FLAT) * norm * across
+    return ((forward <= ((ONE + TIE) * norm + ROUNDING) * across)
+            & (backward < ((ONE - TIE) * norm - ROUNDING) * across) & ((forward < flat) | (backward < flat)))

@@ -91,6 +91,9 @@ class Parameters:
             raise ValueError('intensity_min must be less than intensity_max, got '
                              f'{self.intensity_min:g} and {self.intensity_max:g}')
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Parameters.of, ({field.name: getattr(self, field.name) for field in dataclasses.fields(self)},)
+
     @classmethod
     def paper(cls) -> 'Parameters':
         """The six steps of the paper and nothing more."""
@@ -108,7 +111,7 @@ class Parameters:
             ValueError: There is no such set, or as the class raises.
             TypeError: As the class raises.
         """
-        if name not in PROFILES:
+        if not isinstance(name, str) or name not in PROFILES:
             raise ValueError(f'profile must be one of {", ".join(PROFILES)}, got {name!r}')
         return cls.of({**PROFILES[name], **parameters})
 
@@ -149,6 +152,9 @@ def _checked(field: 'dataclasses.Field[Any]', value: Any) -> Any:
         raise TypeError(f'{expected} {"a whole number" if whole else "a number"} of {spec.range}'
                         f'{spec.unit and " " + spec.unit}, got {value!r}')
     number: Any = value
-    if not (spec.low <= number <= spec.high or (spec.unset and math.isnan(number))):
+    if spec.unset and math.isnan(number):
+        # Always the same object, which is equal to itself, so that equal parameters are.
+        return math.nan
+    if not spec.low <= number <= spec.high:
         raise ValueError(f'{expected} {spec.range}{spec.unit and " " + spec.unit}, got {value!r}')
     return int(number) if whole else float(number)

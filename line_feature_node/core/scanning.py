@@ -280,12 +280,13 @@ def facing_end(
     pixel = np.int64(pixels[index])
     direction = directions[end]
     for k in range(fan_offsets[gap], fan_offsets[gap + 1]):
-        target = pixel + fan[direction, k, 0] + fan[direction, k, 1] * stride
+        step = fan[direction, k, 0]
+        target = pixel + step + fan[direction, k, 1] * stride
         if not (0 <= target < marks.size and marks[target] & ENDING):
             continue
         other = ends[target]
         # A step over the margin leads to the other side of the image.
-        if other == end or links[other] != -1 or abs(target % stride - pixel % stride) > gap + 1:
+        if other == end or links[other] != -1 or not 0 <= pixel % stride + step < stride:
             continue
         facing = (directions[other] - direction + 4 + 1) % 8 <= 2
         between = (np.int64(codes[index]) - codes[end_index(offsets, other)]) % 4

@@ -1,0 +1,189 @@
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, extract_blobs, position
+from line_feature_node.core.buffers import Buffers
+
+Pixels = NDArray[np.int64]
+#: dir, min_row, max_row, min_col, max_col and the pixels as (row, column).
+Blob = tuple[int, int, int, int, int, tuple[tuple[int, int], ...]]
+
+
+def raster(image: NDArray[np.uint8]) -> Pixels:
+    return np.argwhere(image)
+
+
+def backwards(image: NDArray[np.uint8]) -> Pixels:
+    return np.argwhere(image)[::-1]
+
+
+def columns(image: NDArray[np.uint8]) -> Pixels:
+    return np.argwhere(image.T)[:, ::-1]
+
+
+def shuffled(image: NDArray[np.uint8]) -> Pixels:
+    return np.random.default_rng(image.size).permutation(np.argwhere(image))
+
+
+def chains(image: NDArray[np.uint8]) -> Pixels:
+    """From neighbour to neighbour of any code as long as there is one, then elsewhere."""
+    left = {(int(row), int(column)) for row, column in np.argwhere(image)}
+    order = []
+    while left:
+        pixel = min(left)
+        while pixel:
+            order.append(pixel)
+            left.discard(pixel)
+            row, column = pixel
+            beside = [(row + i, column + j) for i in (1, 0, -1) for j in (1, -1, 0) if (row + i, column + j) in left]
+            pixel = beside[0] if beside else None
+    return np.array(order, np.int64).reshape(-1, 2)
+
+
+ORDERS = [raster, backwards, columns, shuffled, chains]
+
+
+def extract(
+    image: NDArray[np.uint8], order: Callable[[NDArray[np.uint8]], Pixels] = raster, margin: int = 1,
+    buffers: Buffers | None = None,
+) -> tuple[Blobs, Pixels]:
+    """The blobs of a quintuple image, given as a list of pixels in some order; and that list, rows and columns."""
+    pixels = order(image)
+    shape = image.shape[0] + 2 * margin, image.shape[1] + 2 * margin
+    flat = (pixels[:, 0] + margin) * shape[1] + pixels[:, 1] + margin
+    codes = image[pixels[:, 0], pixels[:, 1]]
+    return extract_blobs(flat.astype(np.int32), codes, shape, margin, buffers or Buffers()), pixels
+
+
+def listed(blobs: Blobs, pixels: Pixels) -> list[Blob]:
+    """The blobs in use, comparable."""
+    found = []
+    for k, blob in enumerate(blobs.attributes):
+        if blob['select']:
+            members = pixels[blobs.members[blobs.offsets[k]:blobs.offsets[k + 1]]].tolist()
+            assert blob['size'] == len(members)
+            found.append((*(int(blob[name]) for name in ('dir', 'min_row', 'max_row', 'min_col', 'max_col')),
+                          tuple(sorted((row, column) for row, column in members))))
+    return sorted(found)
+
+
+def reference(image: NDArray[np.uint8]) -> list[Blob]:
+    """The connected components of each code by itself."""
+    found = []
+    for code in range(1, 5):
+        count, labels = cv2.connectedComponents((image == code).astype(np.uint8), connectivity=8)
+        for label in range(1, count):
+            pixels = np.argwhere(labels == label)
+            (top, left), (bottom, right) = pixels.min(0).tolist(), pixels.max(0).tolist()
+            found.append((code, top, bottom, left, right, tuple((row, column) for row, column in pixels.tolist())))
+    return sorted(found)
+
+
+@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('density', [0.05, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize('shape', [(40, 53), (1, 90), (90, 1)])
+def test_random_images(
+    order: Callable[[NDArray[np.uint8]], Pixels], density: float, shape: tuple[int, int],
+) -> None:
+    rng = np.random.default_rng(round(density * 100))
+    image = np.where(rng.random(shape) < density, rng.integers(1, 5, shape), 0).astype(np.uint8)
+    assert listed(*extract(image, order)) == reference(image)
+
+
+@settings(max_examples=150, deadline=None)
+@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.sampled_from([0, 1, 1, 2, 4])),
+       st.randoms(use_true_random=False), st.integers(1, 3))
+def test_any_order_of_the_pixels(image: NDArray[np.uint8], random: object, margin: int) -> None:
+    def order(image: NDArray[np.uint8]) -> Pixels:
+        pixels = np.argwhere(image).tolist()
+        random.shuffle(pixels)  # type: ignore[attr-defined]
+        return np.array(pixels, np.int64).reshape(-1, 2)
+
+    assert listed(*extract(image, order, margin)) == reference(image)
+
+
+def drawing(text: str) -> NDArray[np.uint8]:
+    return np.array([[int(cell) if cell.isdigit() else 0 for cell in line] for line in text.split()], np.uint8)
+
+
+@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('text', [
+    # Labels that merge in the last row, all into one.
+    '1.1.1.1.1 1.1.1.1.1 111111111',
+    # A spiral, a comb upside down, and a checkerboard of diagonal neighbours.
+    '1111111 ......1 11111.1 1...1.1 1.111.1 1.....1 1111111',
+    '111111111 1.1.1.1.1 1.1.1.1.1',
+    '1.1.1.1 .1.1.1. 1.1.1.1',
+    # Two codes that cross diagonally: both are connected.
+    '12 21',
+    '2..2 .22. .11. 1..1',
+    '4444 3333 4444 3333',
+])
+def test_shapes(order: Callable[[NDArray[np.uint8]], Pixels], text: str) -> None:
+    image = drawing(text)
+    assert listed(*extract(image, order)) == reference(image)
+
+
+def test_attributes() -> None:
+    image = drawing("""
+        ........
+        .33...1.
+        ...33.1.
+        ......1.
+        ....1...
+        """)
+    blobs, _ = extract(image)
+    used = np.sort(blobs.attributes[blobs.attributes['select']], order=['dir', 'size'])
+    assert [tuple(int(blob[name]) for name in BLOB_DTYPE.names[:-1]) for blob in used] == [
+        (1, 1, 4, 4, 4, 4), (1, 3, 1, 3, 6, 6), (3, 4, 1, 2, 1, 4)]
+
+
+@pytest.mark.parametrize('order', ORDERS)
+def test_members_are_a_partition(order: Callable[[NDArray[np.uint8]], Pixels]) -> None:
+    rng = np.random.default_rng(3)
+    image = rng.choice(np.array([0, 1, 1, 1, 2], np.uint8), (50, 50))
+    blobs, pixels = extract(image, order)
+    assert sorted(blobs.members.tolist()) == list(range(len(pixels)))
+    assert blobs.offsets.size == blobs.attributes.size + 1
+    assert blobs.offsets[0] == 0
+    assert blobs.offsets[-1] == len(pixels)
+    np.testing.assert_array_equal(np.diff(blobs.offsets), blobs.attributes['size'])
+
+
+def test_labels_that_merged_are_empty() -> None:
+    blobs, _ = extract(drawing('1.1.1 1.1.1 11111'))
+    assert blobs.attributes.size == 3
+    assert blobs.attributes['select'].tolist() == [True, False, False]
+    assert blobs.attributes['size'].tolist() == [11, 0, 0]
+
+
+def test_no_pixels() -> None:
+    blobs, _ = extract(np.zeros((5, 5), np.uint8))
+    assert blobs.attributes.size == blobs.members.size == 0
+    assert blobs.offsets.tolist() == [0]
+
+
+def test_frame_after_frame() -> None:
+    """Nothing is left of an image when the next one comes, larger or smaller, with the same memory."""
+    buffers = Buffers()
+    rng = np.random.default_rng(8)
+    for shape in [(30, 40), (30, 40), (60, 50), (7, 9), (40, 30), (1, 1), (60, 50)]:
+        image = rng.integers(0, 5, shape).astype(np.uint8)
+        assert listed(*extract(image, shuffled, buffers=buffers)) == reference(image)
+        assert not buffers.array('colours', 1, np.int32, zeros=True).any()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(1, 2**30), st.data())
+def test_position(stride: int, data: st.DataObject) -> None:
+    """Row and column are exact in an image of 2^30 pixels, at either end of a row too."""
+    row = data.draw(st.integers(0, 2**30 // stride - 1))
+    for column in (0, stride - 1, data.draw(st.integers(0, stride - 1))):
+        assert position(row * stride + column, 1 / stride, stride) == (row, column)

@@ -1,0 +1,38 @@
+import numpy as np
+
+from line_feature_node.core import LineFeatureExtractor
+from line_feature_node.core.buffers import Buffers
+
+
+def test_an_array_stays_until_a_larger_one_is_needed():
+    buffers = Buffers()
+    array = buffers.array('a', 100, np.int32)
+    assert array.size >= 100
+    assert buffers.array('a', 50, np.int32) is array
+    assert buffers.array('a', array.size + 1, np.int32) is not array
+
+
+def test_zeros_are_zero_also_after_growing():
+    buffers = Buffers()
+    assert not buffers.array('a', 10, np.int32, zeros=True).any()
+    assert not buffers.array('a', 100000, np.int32, zeros=True).any()
+
+
+def test_an_image_has_exactly_its_size():
+    buffers = Buffers()
+    image = buffers.image('a', 4, 5, np.uint8)
+    assert image.shape == (4, 5)
+    assert buffers.image('a', 4, 5, np.uint8) is image
+    assert buffers.image('a', 5, 4, np.uint8).shape == (5, 4)
+
+
+def test_the_hot_path_allocates_nothing():
+    """After the first frames of a video every array is one that was there before."""
+    extractor = LineFeatureExtractor()
+    noise = np.random.default_rng(0).integers(0, 255, (3, 120, 160), np.uint8)
+    for frame in noise:
+        extractor.extract(frame)
+    before = {name: id(array) for name, array in extractor._buffers._arrays.items()}
+    for frame in noise:
+        extractor.extract(frame)
+    assert {name: id(array) for name, array in extractor._buffers._arrays.items()} == before

@@ -1,0 +1,139 @@
+import csv
+import os
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from line_feature_node.cli import app
+from line_feature_node.core import SEGMENT_DTYPE, Parameters, extract
+
+STEP = np.repeat(np.where(np.arange(120) < 60, 40, 200).astype(np.uint8)[None], 90, 0)
+
+
+@pytest.fixture
+def run(tmp_path):
+    def run(*arguments):
+        return CliRunner().invoke(app, [*map(str, arguments)], env={'COLUMNS': '200'})
+
+    return run
+
+
+@pytest.fixture
+def photo(tmp_path):
+    path = tmp_path / 'photo.png'
+    cv2.imwrite(str(path), STEP)
+    return path
+
+
+def test_an_image_gives_an_overlay_and_a_table(run, photo, tmp_path):
+    result = run('image', photo, '--out', tmp_path / 'out')
+    assert result.exit_code == 0, result.output
+    assert '120×90, 1 segments, 1 after linking' in result.output
+    assert 'normalization' in result.output
+    overlay = cv2.imread(str(tmp_path / 'out' / 'photo-overlay.png'))
+    assert overlay.shape == (90, 120, 3)
+    with (tmp_path / 'out' / 'photo-segments.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    [segment] = extract(STEP)
+    assert list(rows[0]) == list(SEGMENT_DTYPE.names)
+    for name in SEGMENT_DTYPE.names:
+        np.testing.assert_array_equal(np.float32(rows[0][name]), np.float32(segment[name]))
+
+
+def test_a_bad_file_is_one_line_and_the_others_go_on(run, photo, tmp_path):
+    (tmp_path / 'text.jpg').write_text('no picture')
+    result = run('image', tmp_path / 'missing.png', tmp_path / 'text.jpg', photo, '--out', tmp_path / 'out')
+    assert result.exit_code == 1
+    assert f'{tmp_path}/missing.png: No such file or directory\n' in result.stderr
+    assert f'{tmp_path}/text.jpg: not an image that OpenCV can decode\n' in result.stderr
+    assert len(result.stderr.splitlines()) == 2
+    assert (tmp_path / 'out' / 'photo-overlay.png').exists()
+    assert '1 of 3 files done' in result.stdout
+
+
+def test_status_2_when_nothing_could_be_read(run, tmp_path):
+    result = run('image', tmp_path / 'missing.png', '--out', tmp_path / 'out')
+    assert result.exit_code == 2
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_folder_stands_for_its_images(run, photo, tmp_path):
+    (tmp_path / 'notes.txt').write_text('not an image')
+    cv2.imwrite(str(tmp_path / 'photo.bmp'), STEP)
+    result = run('image', tmp_path, '--out', tmp_path / 'out')
+    assert result.exit_code == 0
+    assert '2 of 2 files done' in result.output
+    assert {path.name for path in (tmp_path / 'out').glob('*.csv')} == {'photo-segments.csv', 'photo-2-segments.csv'}
+
+
+def test_an_empty_folder_is_said(run, tmp_path):
+    result = run('image', tmp_path, '--out', tmp_path / 'out')
+    assert result.exit_code == 2
+    assert 'no image files' in result.stderr
+
+
+def test_hundreds_of_files_keep_their_order(run, photo, tmp_path):
+    result = run('image', *[photo] * 150, '--out', tmp_path / 'out')
+    assert result.exit_code == 0
+    assert '150 of 150 files done' in result.output
+    assert len(list((tmp_path / 'out').glob('*.csv'))) == 150
+
+
+def test_every_parameter_is_an_option_and_reaches_the_extractor(run, photo, tmp_path):
+    output = run('image', '--help').output
+    for name in Parameters.specs():
+        assert f'--{name} ' in output
+    result = run('image', photo, '--out', tmp_path / 'out', '--T1', 900, '--profile', 'paper')
+    assert '0 segments, 0 after linking' in result.output
+
+
+@pytest.mark.parametrize(('arguments', 'sentence'), [
+    (['--T1', '2'], 'T2 must be less than T1'),
+    (['--n', '-1'], 'n must be 0 to 10000'),
+    (['--operator', 'canny'], 'operator must be one of deriche, sobel'),
+    (['--profile', 'fast'], 'profile must be one of default, paper'),
+    (['--T3', '1'], 'No such option'),
+])
+def test_a_bad_parameter_is_one_sentence(run, photo, tmp_path, arguments, sentence):
+    result = run('image', photo, '--out', tmp_path / 'out', *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert 'Traceback' not in result.output
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(run, photo):
+    result = run('image', photo, '--out', photo / 'out')
+    assert result.exit_code == 2
+    assert result.stderr.startswith('cannot write to ')
+
+
+def test_sixteen_bits_and_colour(run, tmp_path):
+    cv2.imwrite(str(tmp_path / 'deep.png'), STEP.astype(np.uint16) * 16)
+    cv2.imwrite(str(tmp_path / 'colour.png'), np.dstack([STEP] * 3))
+    result = run('image', tmp_path, '--out', tmp_path / 'out', '--intensity_max', 4080)
+    assert '1 of 2' not in result.output
+    assert 'deep.png: 120×90, 1 segments' in result.output
+    overlay = cv2.imread(str(tmp_path / 'out' / 'deep-overlay.png'))
+    assert overlay[50, 30].max() < overlay[50, 100].min()
+
+
+def test_the_demo_finds_the_corridor(run, tmp_path):
+    result = run('demo', '--out', tmp_path, '--profile', 'paper')
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / 'corridor-overlay.png').exists()
+    assert result.output.splitlines()[-1] == f'overlay: {tmp_path}/corridor-overlay.png'
+    recall = float(result.output.split('recall ')[1].split(',')[0])
+    assert recall > 0.6
+
+
+def test_as_a_process_without_a_home_or_a_writable_cache(photo, tmp_path):
+    """A read-only installation must work, only slower: Numba has nowhere to put what it compiles."""
+    program = 'from line_feature_node.core.compiling import kernel; print(kernel(lambda x: x + 1)(1))'
+    environment = {**os.environ, 'HOME': '/proc/none', 'XDG_CACHE_HOME': '/proc/none', 'NUMBA_CACHE_DIR': '/proc/none'}
+    done = subprocess.run([sys.executable, '-c', program], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == '2\n', done.stderr
