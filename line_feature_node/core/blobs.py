@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
+from line_feature_node.core.indices import are_neighbours, position
 
 #: The attributes of a line-blob, named as in Fig. 13. `select` says whether the label is in use: labels merge while
 #: colouring, and one that merged into another is not. Rows and columns are those of the image.
@@ -66,30 +67,29 @@ def root(parents: Any, label: int) -> int:
 
 @kernel
 def colour(pixels: Any, codes: Any, stride: int, colours: Any, labels: Any, parents: Any) -> int:
-    """Give each pixel a label that it shares with a neighbour of its code, and merge the labels that meet in it."""
+    """Give the pixels labels, and merge those that meet: neighbours of one code share what their labels merge into.
+
+    Pixels that follow each other in the list and are neighbours, as those of a chain are, share one from the start.
+    Every pair of neighbours is then seen from one of its sides: the right, or the three below.
+    """
     used = 0
-    one, row = np.uint64(1), np.uint64(stride)
     for k in range(pixels.size):
-        # Unsigned indices spare the test whether to count from the end.
-        pixel, code = np.uint64(pixels[k]), codes[k]
-        label = -1
-        for middle in (pixel - row, pixel, pixel + row):
-            for neighbour in (middle - one, middle, middle + one):
-                # A colour is 8 (label + 1) + code; 0 is background or not yet seen.
-                found = colours[neighbour]
-                if found & 7 == code:
-                    other = (found >> 3) - 1
-                    if label == -1:
-                        label = other
-                    elif other != label:
-                        a, b = root(parents, label), root(parents, other)
-                        parents[max(a, b)] = min(a, b)
-        if label == -1:
-            label = used
+        if k == 0 or codes[k] != codes[k - 1] or not are_neighbours(pixels[k], pixels[k - 1], stride):
             parents[used] = used
             used += 1
-        labels[k] = label
-        colours[pixel] = (label + 1) << 3 | code
+        labels[k] = used - 1
+        # A colour is 8 (label + 1) + code; 0 is background.
+        colours[pixels[k]] = used << 3 | codes[k]
+    # Unsigned indices spare the test whether to count from the end.
+    one, row = np.uint64(1), np.uint64(stride)
+    for k in range(pixels.size):
+        pixel = np.uint64(pixels[k])
+        own, below = colours[pixel], pixel + row
+        for neighbour in (pixel + one, below - one, below, below + one):
+            found = colours[neighbour]
+            if found != own and found & 7 == own & 7:
+                a, b = root(parents, (own >> 3) - 1), root(parents, (found >> 3) - 1)
+                parents[max(a, b)] = min(a, b)
     for k in range(pixels.size):
         colours[pixels[k]] = 0
     return used
@@ -103,11 +103,11 @@ def collect(
     """Bring each pixel to its final label, and fill in the attributes and members of the blobs."""
     inverse = 1 / stride
     for label in range(blobs.size):
+        parents[label] = parents[parents[label]]
         clear(blobs[label])
         blobs[label]['select'] = parents[label] == label
     for k in range(pixels.size):
-        label = root(parents, labels[k])
-        labels[k] = label
+        label = labels[k] = parents[labels[k]]
         row, column = position(pixels[k], inverse, stride)
         include(blobs[label], codes[k], row - margin, column - margin)
     total = 0
@@ -121,16 +121,6 @@ def collect(
     for label in range(blobs.size, 0, -1):
         offsets[label] = offsets[label - 1]
     offsets[0] = 0
-
-
-@inlined
-def position(pixel: int, inverse: float, stride: int) -> tuple[Any, Any]:
-    """Row and column of a flat index.
-
-    The product replaces a slow division; half a pixel keeps it off whole numbers, where rounding would matter.
-    """
-    row = np.int64((pixel + 0.5) * inverse)
-    return row, pixel - row * stride
 
 
 @inlined

@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from line_feature_node.core.blobs import Blobs, position
+from line_feature_node.core.blobs import Blobs
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
+from line_feature_node.core.indices import position
 from line_feature_node.core.parameters import Parameters
 
 #: One segment, as users get it and as the PointCloud2 message lays it out. Pixels and radians; the centre of the

@@ -192,6 +192,14 @@ def cell_of(line: Any, end: int, cell: float) -> tuple[int, int]:
 
 
 @inlined
+def is_near(first: Any, end: int, second: Any, other_end: int, tau2: float) -> bool:
+    """Whether an end of one line is not farther than tau2 from an end of another: what most in a cell are not."""
+    x1, y1 = (first['x1'], first['y1']) if end == 0 else (first['x2'], first['y2'])
+    x2, y2 = (second['x1'], second['y1']) if other_end == 0 else (second['x2'], second['y2'])
+    return squared(x1 - x2, y1 - y2) <= tau2 * tau2
+
+
+@inlined
 def insert(k: int, lines: Any, cell: float, entries: Any, cells: Any) -> None:
     """Put both ends of a line into the grid."""
     for end in range(2):
@@ -218,10 +226,13 @@ def find_pairs(
                 entry = cells[i, j]
                 while entry != -1:
                     other = entry // 2
-                    gap, ends = nearest_ends(line, lines[other])
                     # Of the up to four ways to meet a pair here, its nearest ends are the one that counts.
-                    if (alive[other] and gap < tau2 and ends == 2 * end + entry % 2
-                            and collinear(line, lines[other], tau1) and not overlapped(line, lines[other])):
+                    if alive[other] and is_near(line, end, lines[other], entry % 2, tau2):
+                        gap, ends = nearest_ends(line, lines[other])
+                        if (gap >= tau2 or ends != 2 * end + entry % 2 or not collinear(line, lines[other], tau1)
+                                or overlapped(line, lines[other])):
+                            entry = entries[entry]
+                            continue
                         if found == gaps.size or found == pairs.shape[0]:
                             return -1, waiting
                         swapped = precedes(line, lines[other]) > 0

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.edges import CODE, STRONG
+from line_feature_node.core.indices import are_neighbours
 from line_feature_node.core.parameters import Parameters
 
 #: Column and row steps of the eight directions.
@@ -355,7 +356,8 @@ def assemble(
     length = 0
     offsets[0] = 0
     for chain in range(raw):
-        if done[chain]:
+        alone = links[2 * chain] == -1 and links[2 * chain + 1] == -1
+        if done[chain] or (alone and raw_offsets[chain + 1] - raw_offsets[chain] < min_chain):
             continue
         start = first_end(chain, links)
         first = length
@@ -419,13 +421,6 @@ def bridge(target: int, stride: int, pixels: Any, codes: Any, bridged: Any, leng
         bridged[length] = True
         length += 1
     return length
-
-
-@inlined
-def are_neighbours(a: int, b: int, stride: int) -> bool:
-    """Whether two different pixels touch."""
-    step = abs(a - b)
-    return step == 1 or (stride - 1 <= step <= stride + 1)
 
 
 @inlined
