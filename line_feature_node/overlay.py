@@ -33,7 +33,7 @@ def draw_overlay(image: NDArray[Any], segments: NDArray[np.void], caption: str =
         cv2.line(canvas, (x1, y1), (x2, y2), COLOURS[code], thickness, cv2.LINE_AA, SHIFT)
     for x1, y1, x2, y2 in points.tolist():
         for end in ((x1, y1), (x2, y2)):
-            cv2.circle(canvas, end, round((thickness + 0.5) * 2**SHIFT), (255, 255, 255), -1, cv2.LINE_AA, SHIFT)
+            cv2.circle(canvas, end, round(thickness * 1.2 * 2**SHIFT), (255, 255, 255), -1, cv2.LINE_AA, SHIFT)
     if caption:
         _write(canvas, caption)
     return canvas

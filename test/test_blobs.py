@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, extract_blobs, position
+from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, extract_blobs
 from line_feature_node.core.buffers import Buffers
 
 Pixels = NDArray[np.int64]
@@ -159,9 +159,10 @@ def test_members_are_a_partition(order: Callable[[NDArray[np.uint8]], Pixels]) -
 
 def test_labels_that_merged_are_empty() -> None:
     blobs, _ = extract(drawing('1.1.1 1.1.1 11111'))
-    assert blobs.attributes.size == 3
-    assert blobs.attributes['select'].tolist() == [True, False, False]
-    assert blobs.attributes['size'].tolist() == [11, 0, 0]
+    used = blobs.attributes['select']
+    assert used.size > 1
+    assert blobs.attributes['size'][used].tolist() == [11]
+    assert not blobs.attributes['size'][~used].any()
 
 
 def test_no_pixels() -> None:
@@ -178,12 +179,3 @@ def test_frame_after_frame() -> None:
         image = rng.integers(0, 5, shape).astype(np.uint8)
         assert listed(*extract(image, shuffled, buffers=buffers)) == reference(image)
         assert not buffers.array('colours', 1, np.int32, zeros=True).any()
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.integers(1, 2**30), st.data())
-def test_position(stride: int, data: st.DataObject) -> None:
-    """Row and column are exact in an image of 2^30 pixels, at either end of a row too."""
-    row = data.draw(st.integers(0, 2**30 // stride - 1))
-    for column in (0, stride - 1, data.draw(st.integers(0, stride - 1))):
-        assert position(row * stride + column, 1 / stride, stride) == (row, column)

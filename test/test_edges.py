@@ -53,7 +53,9 @@ def marks_of(image: npt.NDArray[Any], buffers: Buffers | None = None, **paramete
     return marks[MARGIN:MARGIN + height, MARGIN:MARGIN + width].copy()
 
 
-def gradient_of(image: npt.NDArray[Any], operator: str = 'deriche', alpha: float = 1.0) -> tuple[Floats, Floats, Floats]:
+def gradient_of(
+    image: npt.NDArray[Any], operator: str = 'deriche', alpha: float = 1.0,
+) -> tuple[Floats, Floats, Floats]:
     """gx, gy and norm of each pixel, from the smoothed plane that the sweep leaves and with its kernels."""
     buffers = Shelf()
     marks_of(image, buffers, operator=operator, alpha=alpha)
@@ -293,7 +295,9 @@ def test_constant_image_has_no_edge(operator: dict[str, Any], value: int) -> Non
                 assert not marks_of(image, T1=0.02, T2=0.01, **operator).any(), image.shape
 
 
-@pytest.mark.parametrize(('dtype', 'value'), [(np.uint16, 0), (np.uint16, 65535), (np.float32, -500), (np.float32, 5e4)])
+@pytest.mark.parametrize(('dtype', 'value'), [
+    (np.uint16, 0), (np.uint16, 65535), (np.float32, -500), (np.float32, 5e4),
+])
 def test_constant_image_of_other_types(dtype: type, value: float) -> None:
     for shape in [(1, 1), (1, 50), (50, 1), (37, 53)]:
         assert not marks_of(np.full(shape, value, dtype), T1=0.4, T2=0.2).any()

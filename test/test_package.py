@@ -6,6 +6,8 @@ import runpy
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from line_feature_node.core import Parameters
@@ -41,20 +43,15 @@ def test_readme_table_is_that_of_the_parameters():
         assert f'| `{name}` |' in readme
 
 
-def test_readme_example_runs():
+def test_readme_example_runs(monkeypatch):
     readme = (ROOT / 'README.md').read_text(encoding='utf-8')
     example = readme.split('```python\n')[1].split('```')[0]
     assert len(example.strip().splitlines()) <= 5
-    import cv2
-    import numpy as np
     picture = np.zeros((60, 80, 3), np.uint8)
     picture[:, 40:] = 200
-    original, cv2.imread = cv2.imread, lambda _: picture
-    try:
-        scope = {}
-        exec(compile(example, 'README.md', 'exec'), scope)
-    finally:
-        cv2.imread = original
+    monkeypatch.setattr(cv2, 'imread', lambda _: picture)
+    scope = {}
+    exec(compile(example, 'README.md', 'exec'), scope)
     assert len(scope['segments']) == 1
 
 

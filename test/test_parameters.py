@@ -34,7 +34,7 @@ def test_defaults_are_valid() -> None:
 def test_every_parameter_is_described() -> None:
     for name, spec in SPECS.items():
         assert spec.description.endswith('.'), name
-        assert spec.choices or math.isfinite(spec.low) and math.isfinite(spec.high), name
+        assert spec.choices or (math.isfinite(spec.low) and math.isfinite(spec.high)), name
 
 
 @pytest.mark.parametrize(('name', 'end'), [
@@ -82,7 +82,8 @@ def test_unset_are_the_intensities() -> None:
 
 
 @pytest.mark.parametrize('name', NUMBERS)
-@pytest.mark.parametrize('value', [True, False, np.True_, '1', 'nan', None, [1], (1,), 1j, np.array([1.0]), b'1'], ids=repr)
+@pytest.mark.parametrize('value', [True, False, np.True_, '1', 'nan', None, [1], (1,), 1j, np.array([1.0]), b'1'],
+                         ids=repr)
 def test_what_is_no_number_is_refused(name: str, value: Any) -> None:
     with pytest.raises(TypeError, match=rf'^{name} must be a (whole )?number of ') as caught:
         Parameters(**{name: value})

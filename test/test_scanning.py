@@ -388,6 +388,31 @@ def test_no_bridge_between_ends_that_do_not_face_each_other(text: str) -> None:
     assert not any(any(chain.bridged) for chain in chains)
 
 
+@pytest.mark.parametrize('code', [1, 2, 3, 4])
+@pytest.mark.parametrize('turns', range(4))
+@pytest.mark.parametrize('mirror', [False, True])
+def test_no_bridge_around_a_corner(code: int, turns: int, mirror: bool) -> None:
+    """Of equal codes too: the ends of the two sides of a right angle don't point at each other."""
+    codes = np.zeros((9, 9), np.uint8)
+    codes[0, :7] = codes[2:, 8] = code
+    codes = np.rot90(codes[::-1] if mirror else codes, turns).copy()
+    chains = scan(codes, max_gap=2)
+    assert [len(chain.pixels) for chain in chains] == [7, 7]
+
+
+@pytest.mark.parametrize('width', [6, 7, 13, 14, 30])
+@pytest.mark.parametrize('flip', [False, True])
+@pytest.mark.parametrize('mirror', [False, True])
+def test_bridge_in_a_narrow_image(width: int, mirror: bool, flip: bool) -> None:
+    """A sloping line and the vertical that continues it, however few pixels a row has."""
+    codes = np.zeros((9, 6), np.uint8)
+    codes[[8, 8, 7, 7, 6], range(5)] = 4 if mirror != flip else 2
+    codes[:5, 5] = 1
+    codes = np.pad(codes[::-1 if flip else 1, ::-1 if mirror else 1], ((0, 0), (0, width - 6)))
+    [chain] = scan(codes, max_gap=1)
+    assert len(chain.pixels) == 11
+
+
 @pytest.mark.parametrize('stroke', ['1', '3'])
 def test_no_bridge_over_an_occupied_pixel(stroke: str) -> None:
     beside = [f'........{stroke}........'] * 4

@@ -76,11 +76,17 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
 
 
 def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float, float]:
-    """Scale and offset that bring pixel values to grey levels."""
+    """Scale and offset that bring pixel values to grey levels.
+
+    Raises:
+        ValueError: One end of the range is given, and beyond the other, which the type sets.
+    """
     low, high = parameters.intensity_min, parameters.intensity_max
     low = 0.0 if math.isnan(low) else low
     if math.isnan(high):
         high = float(np.iinfo(dtype).max) if dtype.kind == 'u' else 255.0
+    if low >= high:
+        raise ValueError(f'intensity_min must be less than intensity_max, got {low:g} and {high:g} for {dtype} pixels')
     scale = 255.0 / (high - low)
     return scale, -scale * low
 
@@ -271,7 +277,10 @@ def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2:
     The norm of a pixel is compared with two norms one step along the gradient, forward (to the right, or down where
     the gradient is steep) and backward, each interpolated between the two neighbours that straddle it: with weights
     |gx| - |gy| and |gy| for a flat gradient, so that all sides of a comparison are multiplied by |gx| instead of
-    dividing. It stays when greater than both. A tie is won by its first pixel: forward may be equal, backward not.
+    dividing. It stays when greater than both.
+
+    A tie is won by its first pixel: forward may be equal, backward not. That holds for codes 1 and 3. Of a diagonal
+    tie neither pixel stays: the two touch at a corner, and between the other two pixels there runs the ridge.
     """
     for i in range(marks.size):
         j = i + PAD
@@ -284,25 +293,28 @@ def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2:
         northeast, northwest, southeast, southwest = above[j + 1], above[j - 1], below[j + 1], below[j - 1]
         norm = middle[j]
         across = ahead + aside
+        code_1, code_3 = ay <= SECTION * ax, ax <= SECTION * ay
+        slack = TIE * norm + ROUNDING
+        least_forward = (norm + (slack if code_1 | code_3 else -slack)) * across
+        least_backward = (norm - slack) * across
+        within_ramp = (ONE - FLAT) * norm * across
         # Both answers are computed: to select among the neighbours first would make gather instructions of the loads.
-        flat_maximum = is_maximum(norm, across, ahead * east + aside * (southeast if same else northeast),
-                                  ahead * west + aside * (northwest if same else southwest))
-        steep_maximum = is_maximum(norm, across, ahead * south + aside * (southeast if same else southwest),
-                                   ahead * north + aside * (northwest if same else northeast))
+        flat_maximum = is_maximum(
+            ahead * east + aside * (southeast if same else northeast), least_forward,
+            ahead * west + aside * (northwest if same else southwest), least_backward, within_ramp)
+        steep_maximum = is_maximum(
+            ahead * south + aside * (southeast if same else southwest), least_forward,
+            ahead * north + aside * (northwest if same else northeast), least_backward, within_ramp)
         maximum = (steep & steep_maximum) | ((not steep) & flat_maximum)
         code = CODE_2 if same else CODE_4
-        code = CODE_3 if ax <= SECTION * ay else code
-        code = CODE_1 if ay <= SECTION * ax else code
+        code = CODE_3 if code_3 else code
+        code = CODE_1 if code_1 else code
         code = code | (STRONG_MARK if norm > T1 else NO_MARK)
         marks[i] = code if maximum & (norm > T2) else NO_MARK
 
 
 @inlined
-def is_maximum(norm: Any, across: Any, forward: Any, backward: Any) -> bool:
-    """Whether a norm is greater than the two beside it, or the first of two equal ones; but not within a ramp.
-
-    The norms forward and backward come multiplied by `across`.
-    """
-    flat = (ONE - FLAT) * norm * across
-    return ((forward <= ((ONE + TIE) * norm + ROUNDING) * across)
-            & (backward < ((ONE - TIE) * norm - ROUNDING) * across) & ((forward < flat) | (backward < flat)))
+def is_maximum(forward: Any, least_forward: Any, backward: Any, least_backward: Any, within_ramp: Any) -> bool:
+    """Whether the norms beside a pixel are below what they must be, and one of them by more than within a ramp."""
+    return ((forward < least_forward) & (backward < least_backward)
+            & ((forward < within_ramp) | (backward < within_ramp)))

@@ -35,7 +35,7 @@ def link_lines(
         For each line, the appended ones included, whether it is left: a merged one's parts are not.
     """
     height, width = shape
-    cell = max(parameters.tau2, SMALLEST_CELL)
+    cell = max(2 * parameters.tau2, SMALLEST_CELL)
     rows, columns = int(height / cell) + 1, int(width / cell) + 1
     alive = buffers.array('alive', 2 * count, np.bool_)
     entries = buffers.array('entries', 4 * count, np.int32)
@@ -185,10 +185,10 @@ def pop(heap: Any, size: int, lines: Any, pairs: Any, gaps: Any) -> int:
 
 
 @inlined
-def cell_of(line: Any, end: int, cell: float) -> tuple[int, int]:
-    """Row and column of the grid in which an end of a line lies."""
+def place_of(line: Any, end: int, cell: float) -> tuple[float, float]:
+    """Where an end of a line lies in the grid, in cells downwards and to the right."""
     x, y = (line['x1'], line['y1']) if end == 0 else (line['x2'], line['y2'])
-    return int((y + 0.5) / cell), int((x + 0.5) / cell)
+    return (y + 0.5) / cell, (x + 0.5) / cell
 
 
 @inlined
@@ -203,9 +203,9 @@ def is_near(first: Any, end: int, second: Any, other_end: int, tau2: float) -> b
 def insert(k: int, lines: Any, cell: float, entries: Any, cells: Any) -> None:
     """Put both ends of a line into the grid."""
     for end in range(2):
-        row, column = cell_of(lines[k], end, cell)
-        entries[2 * k + end] = cells[row, column]
-        cells[row, column] = 2 * k + end
+        down, right = place_of(lines[k], end, cell)
+        entries[2 * k + end] = cells[int(down), int(right)]
+        cells[int(down), int(right)] = 2 * k + end
 
 
 @inlined
@@ -220,9 +220,10 @@ def find_pairs(
     """
     line = lines[k]
     for end in range(2):
-        row, column = cell_of(line, end, cell)
-        for i in range(max(row - 1, 0), min(row + 2, cells.shape[0])):
-            for j in range(max(column - 1, 0), min(column + 2, cells.shape[1])):
+        # A cell is twice tau2 wide or more: what is near lies in it or in those on the nearer sides.
+        down, right = place_of(line, end, cell)
+        for i in range(max(int(down + 0.5) - 1, 0), min(int(down + 0.5) + 1, cells.shape[0])):
+            for j in range(max(int(right + 0.5) - 1, 0), min(int(right + 0.5) + 1, cells.shape[1])):
                 entry = cells[i, j]
                 while entry != -1:
                     other = entry // 2

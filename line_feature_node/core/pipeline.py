@@ -104,7 +104,8 @@ class LineFeatureExtractor:
 
         Raises:
             TypeError: The image is no array or has another type of pixel.
-            ValueError: The image has another shape, no pixels, or pixels that are NaN or infinite.
+            ValueError: The image has another shape, no pixels, or pixels that are NaN or infinite; or intensity_min or
+                intensity_max, of which only one is given, contradicts the type of the pixels.
         """
         last = time.perf_counter()
 

@@ -10,6 +10,7 @@ of two that bend alike it takes the one that turns back, as a digital straight l
 itself starts chains of its own, so all that is connected to a strong pixel is visited: that is the hysteresis.
 """
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,6 +83,14 @@ def _fan(longest: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 NEXT_STATE = _next_state()
+
+
+@lru_cache(maxsize=8)
+def _state_steps(stride: int) -> NDArray[np.int64]:
+    """What a step in the direction of each state adds to a flat index."""
+    return np.repeat(STEP_X + stride * STEP_Y, 2)
+
+
 FAN, FAN_OFFSETS = _fan(8)
 
 
@@ -121,8 +130,8 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
     most = int(np.count_nonzero(flat))
     raw_pixels, raw_codes = buffers.array('raw pixels', most, np.int32), buffers.array('raw codes', most, np.uint8)
     raw_offsets = buffers.array('raw offsets', most + 1, np.int32)
-    raw = trace(flat, flat.view(np.uint64), stride, NEXT_STATE, raw_pixels, raw_codes, raw_offsets,
-                buffers.array('stack', most, np.int32))
+    raw = trace(flat, flat.view(np.uint64), stride, NEXT_STATE, _state_steps(stride), raw_pixels, raw_codes,
+                raw_offsets, buffers.array('stack', most, np.int32))
     links = buffers.array('links', 2 * raw, np.int32)
     link_gaps(flat, stride, raw, parameters.max_gap, FAN, FAN_OFFSETS, raw_pixels, raw_codes, raw_offsets,
               buffers.array('ends', flat.size, np.int32), buffers.array('end directions', 2 * raw, np.uint8), links)
@@ -138,7 +147,9 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
 
 
 @kernel
-def trace(marks: Any, words: Any, stride: int, table: Any, pixels: Any, codes: Any, offsets: Any, stack: Any) -> int:
+def trace(
+    marks: Any, words: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any, offsets: Any, stack: Any,
+) -> int:
     """Visit all candidates that are connected to a strong one; return the number of chains that this made."""
     chains = 0
     length = 0
@@ -149,16 +160,17 @@ def trace(marks: Any, words: Any, stride: int, table: Any, pixels: Any, codes: A
         for seed in range(8 * word, 8 * word + 8):
             if marks[seed] & STRONG == 0:
                 continue
-            length, top = trace_chain(seed, marks, stride, table, pixels, codes, length, stack, 0)
+            length, top = trace_chain(seed, marks, stride, table, steps, pixels, codes, length, stack, 0)
             chains += 1
             offsets[chains] = length
             while top > 0:
                 top -= 1
                 beside = stack[top]
                 for direction in range(8):
-                    start = beside + STEP_X[direction] + stride * STEP_Y[direction]
+                    start = beside + steps[2 * direction]
                     if marks[start] & CANDIDATE:
-                        length, top = trace_chain(start, marks, stride, table, pixels, codes, length, stack, top)
+                        length, top = trace_chain(
+                            start, marks, stride, table, steps, pixels, codes, length, stack, top)
                         chains += 1
                         offsets[chains] = length
     return chains
@@ -166,7 +178,8 @@ def trace(marks: Any, words: Any, stride: int, table: Any, pixels: Any, codes: A
 
 @kernel
 def trace_chain(
-    start: int, marks: Any, stride: int, table: Any, pixels: Any, codes: Any, length: int, stack: Any, top: int,
+    start: int, marks: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any, length: int, stack: Any,
+    top: int,
 ) -> tuple[int, int]:
     """Append the chain through a pixel: first its arm against the edge's direction, turned round, then that along it.
 
@@ -177,12 +190,12 @@ def trace_chain(
     code = marks[start] & CODE
     direction = (code + 1) % 8
     marks[start] = TAKEN
-    length, top = walk(start, (direction + 4) % 8, marks, stride, table, pixels, codes, length, stack, top)
+    length, top = walk(start, (direction + 4) % 8, marks, stride, table, steps, pixels, codes, length, stack, top)
     reverse(pixels, first, length)
     reverse(codes, first, length)
     pixels[length] = start
     codes[length] = code
-    length, top = walk(start, direction, marks, stride, table, pixels, codes, length + 1, stack, top)
+    length, top = walk(start, direction, marks, stride, table, steps, pixels, codes, length + 1, stack, top)
     if open_neighbours(marks, start, stride) != 0:
         stack[top] = start
         top += 1
@@ -191,8 +204,8 @@ def trace_chain(
 
 @inlined
 def walk(
-    start: int, direction: int, marks: Any, stride: int, table: Any, pixels: Any, codes: Any, length: int, stack: Any,
-    top: int,
+    start: int, direction: int, marks: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any, length: int,
+    stack: Any, top: int,
 ) -> tuple[int, int]:
     """Append the pixels that follow the start in a direction, and put those beside which others stay on the stack."""
     pixel = start
@@ -206,7 +219,7 @@ def walk(
         if following == END:
             break
         state = following
-        pixel += STEP_X[state // 2] + stride * STEP_Y[state // 2]
+        pixel += steps[state]
         pixels[length] = pixel
         codes[length] = marks[pixel] & CODE
         marks[pixel] = TAKEN
@@ -311,10 +324,8 @@ def end_direction(pixels: Any, offsets: Any, end: int, stride: int) -> int:
         return END
     index = end_index(offsets, end)
     inner = pixels[index + reach if end % 2 == 0 else index - reach]
-    step = np.int64(pixels[index]) - inner
-    # A step of up to REACH pixels, as rows and columns: rounded to whole rows, what is left is columns.
-    y = (step + stride // 2) // stride
-    x = step - y * stride
+    x = pixels[index] % stride - inner % stride
+    y = pixels[index] // stride - inner // stride
     # 2 : 5 stands for tan 22.5 degrees, which no pair of steps up to REACH can tell from it.
     if 5 * abs(y) < 2 * abs(x):
         return 0 if x > 0 else 4
