@@ -40,7 +40,7 @@ def _parameter(default: Any, description: str, **spec: Any) -> Any:
     return dataclasses.field(default=default, metadata={'spec': Spec(description, **spec)})
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Parameters:
     """Every parameter of the pipeline, checked when made and never changed after.
 
@@ -91,8 +91,15 @@ class Parameters:
             raise ValueError('intensity_min must be less than intensity_max, got '
                              f'{self.intensity_min:g} and {self.intensity_max:g}')
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Parameters.of, ({field.name: getattr(self, field.name) for field in dataclasses.fields(self)},)
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Parameters) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[Any, ...]:
+        """All values; None for unset ones, since NaN is not equal to itself."""
+        return tuple(None if value != value else value for value in vars(self).values())
 
     @classmethod
     def paper(cls) -> 'Parameters':
@@ -152,9 +159,6 @@ def _checked(field: 'dataclasses.Field[Any]', value: Any) -> Any:
         raise TypeError(f'{expected} {"a whole number" if whole else "a number"} of {spec.range}'
                         f'{spec.unit and " " + spec.unit}, got {value!r}')
     number: Any = value
-    if spec.unset and math.isnan(number):
-        # Always the same object, which is equal to itself, so that equal parameters are.
-        return math.nan
-    if not spec.low <= number <= spec.high:
+    if not (spec.low <= number <= spec.high or (spec.unset and math.isnan(number))):
         raise ValueError(f'{expected} {spec.range}{spec.unit and " " + spec.unit}, got {value!r}')
     return int(number) if whole else float(number)
