@@ -3,8 +3,8 @@
 Deriche's operator (reference 15 of the paper) with q = exp(-alpha) has the derivative n q^|n| along one axis and the
 smoothing (alpha |n| + 1) q^|n| along the other. With E(n) = q^|n| both are short stencils on one smoothed image:
 n q^|n| is [-1 0 1] * (E * E), and (alpha |n| + 1) q^|n| is [b a b] * (E * E), up to scale. So the whole operator is
-E * E along x and along y, four recursions of second order, and then a 3x3 stencil like Sobel's. Sobel is that stencil
-alone, with b : a = 1 : 2.
+E * E along x and along y, four recursions of second order, and then a 3x3 stencil like Sobel's. The other operators are
+such a stencil alone, on the image itself or, for the derivative of a Gaussian, on the smoothed one.
 
 All arrays of a frame are padded: the planes by two replicated rows and columns on each side, the marks by one of zeros.
 """
@@ -12,6 +12,7 @@ All arrays of a frame are padded: the planes by two replicated rows and columns 
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,11 +49,12 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
 
     Args:
         image: H×W uint8, uint16 or float32, C-contiguous.
-        parameters: operator, alpha, T1, T2, intensity_min and intensity_max are used.
+        parameters: operator, alpha, sigma, T1, T2, thinning, intensity_min and intensity_max are used.
         buffers: Memory to work in.
 
     Returns:
-        Marks, uint8: the CODE of each pixel that passed the suppression and exceeds T2, with STRONG where it exceeds
+        Marks, uint8: the CODE of each pixel that passed the suppression (where that is the way of thinning) and
+        exceeds T2, with STRONG where it exceeds
         T1, and 0 elsewhere; padded by MARGIN on each side, and at the right to a multiple of eight columns.
     """
     height, width = image.shape
@@ -71,7 +73,13 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     else:
         side, centre = STENCILS[parameters.operator]
         copy_replicated(image, scale, offset, plane)
-    sweep(height, width, recursive, q, side, centre, parameters.T1, parameters.T2, plane, rows, marks)
+    if parameters.operator == 'dog':
+        smoothed = buffers.image('smoothed', lines + 2 * PAD, columns, np.float32)
+        inside = slice(height + 2 * PAD), slice(width + 2 * PAD)
+        cv2.GaussianBlur(plane[inside], (0, 0), parameters.sigma, dst=smoothed[inside], borderType=cv2.BORDER_REPLICATE)
+        plane = smoothed
+    sweep(height, width, recursive, q, side, centre, parameters.T1, parameters.T2,
+          parameters.thinning == 'suppression', plane, rows, marks)
     return marks
 
 
@@ -91,8 +99,9 @@ def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float
     return scale, -scale * low
 
 
-#: The 3x3 operators as side and centre of their smoothing; derivative and smoothing together have unit gain on a ramp.
-STENCILS = {'sobel': (1 / 8, 2 / 8)}
+#: Side and centre of the smoothing that goes with the derivative [-1 0 1]; together they have unit gain on a ramp. The
+#: derivative of a Gaussian is a central difference of the smoothed image, which needs no smoothing besides.
+STENCILS = {'sobel': (1 / 8, 2 / 8), 'prewitt': (1 / 6, 1 / 6), 'scharr': (3 / 32, 10 / 32), 'dog': (0.0, 1 / 2)}
 
 
 def deriche_stencil(alpha: float) -> tuple[float, float]:
@@ -233,7 +242,7 @@ def start_upwards(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
 
 @kernel
 def sweep(
-    height: int, width: int, recursive: bool, q: float, side: float, centre: float, T1: float, T2: float,
+    height: int, width: int, recursive: bool, q: float, side: float, centre: float, T1: float, T2: float, thin: bool,
     plane: Any, rows: Any, marks: Any,
 ) -> None:
     """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it."""
@@ -248,7 +257,7 @@ def sweep(
         gradient(across, along, b, a, gx[above], gy[above], norm[above])
         if row < height:
             suppress(norm[above], norm[middle], norm[below], gx[middle], gy[middle], np.float32(T1), np.float32(T2),
-                     marks[row + MARGIN, MARGIN:MARGIN + width])
+                     thin, marks[row + MARGIN, MARGIN:MARGIN + width])
 
 
 @inlined
@@ -271,8 +280,10 @@ def gradient(across: Any, along: Any, side: Any, centre: Any, gx: Any, gy: Any, 
 
 
 @inlined
-def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2: Any, marks: Any) -> None:
-    """Non-maximum suppression, thresholds and direction codes of one row.
+def suppress(
+    above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2: Any, thin: bool, marks: Any,
+) -> None:
+    """Non-maximum suppression, unless edges are to stay thick, thresholds and direction codes of one row.
 
     The norm of a pixel is compared with two norms one step along the gradient, forward (to the right, or down where
     the gradient is steep) and backward, each interpolated between the two neighbours that straddle it: with weights
@@ -305,7 +316,7 @@ def suppress(above: Any, middle: Any, below: Any, gx: Any, gy: Any, T1: Any, T2:
         steep_maximum = is_maximum(
             ahead * south + aside * (southeast if same else southwest), least_forward,
             ahead * north + aside * (northwest if same else northeast), least_backward, within_ramp)
-        maximum = (steep & steep_maximum) | ((not steep) & flat_maximum)
+        maximum = (steep & steep_maximum) | ((not steep) & flat_maximum) | (not thin)
         code = CODE_2 if same else CODE_4
         code = CODE_3 if code_3 else code
         code = CODE_1 if code_1 else code

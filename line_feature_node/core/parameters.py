@@ -52,9 +52,13 @@ class Parameters:
     """
 
     operator: str = _parameter(
-        'deriche', 'Edge operator: Deriche, best in noise, or Sobel, least memory.', choices=('deriche', 'sobel'))
+        'deriche', 'Edge operator; dog is the derivative of a Gaussian.',
+        choices=('deriche', 'sobel', 'prewitt', 'scharr', 'dog'))
     alpha: float = _parameter(
         1.0, "Width of Deriche's operator: smaller smooths more.", low=0.2, high=5.0, unit='1/pixel')
+    sigma: float = _parameter(
+        1.0, 'Standard deviation of the Gaussian, for the operator dog: larger smooths more.',
+        low=0.3, high=10.0, unit='pixels')
     T1: float = _parameter(
         8.0, 'Upper threshold of the hysteresis: a stronger gradient is an edge.',
         low=0.0, high=1000.0, unit='grey levels/pixel')
@@ -66,6 +70,9 @@ class Parameters:
     intensity_max: float = _parameter(
         math.nan, 'Pixel value that counts as grey level 255; unset: the largest of the integer type, 255 for floats.',
         low=-1e9, high=1e9, unset=True)
+    thinning: str = _parameter(
+        'suppression', 'How edges are thinned: by suppressing what is no maximum of the gradient, by morphology after '
+        'the hysteresis, or not at all (then there are no chains).', choices=('suppression', 'morphological', 'none'))
     max_gap: int = _parameter(2, 'Longest gap in a broken edge that is bridged.', low=0, high=8, unit='pixels')
     min_chain: int = _parameter(8, 'Shorter edge chains are dropped.', low=1, high=100000, unit='pixels')
     n: int = _parameter(

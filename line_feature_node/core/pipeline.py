@@ -19,6 +19,7 @@ from line_feature_node.core.linking import link_lines
 from line_feature_node.core.normalization import normalize_codes
 from line_feature_node.core.parameters import Parameters
 from line_feature_node.core.scanning import TAKEN, scan_edges
+from line_feature_node.core.thinning import thin, unscanned
 
 #: What a frame goes through, as `times` names it: `input` is the check and the conversion to grey.
 STEPS = ('input', 'edges', 'scanning', 'normalization', 'blobs', 'features', 'linking')
@@ -39,7 +40,7 @@ class Stages:
 
     Attributes:
         grey: H×W, the image as the first step saw it, before its intensity is mapped.
-        candidates: H×W uint8, codes of the pixels that pass the suppression and exceed T2, 0 elsewhere.
+        candidates: H×W uint8, codes of the pixels that pass the thinning and exceed T2, 0 elsewhere.
         strong: H×W bool, those of them that exceed T1.
         edges: H×W uint8, the quintuple image after hysteresis: codes of all edge pixels, 0 elsewhere.
         chain_pixels: Pixels of the chains, filled gaps included.
@@ -142,8 +143,10 @@ class LineFeatureExtractor:
         grey = grey_image(image, buffers)
         watch('input', grey)
         marks = extract_edges(grey, p, buffers)
+        if p.thinning == 'morphological':
+            thin(marks)
         watch('edges', marks)
-        chains = scan_edges(marks, p, buffers)
+        chains = unscanned(marks, buffers) if p.thinning == 'none' else scan_edges(marks, p, buffers)
         watch('scanning', (chains, marks))
         normalize_codes(chains, p.n)
         watch('normalization', chains.codes)
