@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from line_feature_node import files, scenes, truth
-from line_feature_node.core import PROFILES, STEPS, Parameters
+from line_feature_node import files, scenes, section3, truth
+from line_feature_node.core import PROFILES, STEPS, Parameters, end_points
+from line_feature_node.figures import sheet
+from line_feature_node.images import decode
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
@@ -62,6 +64,7 @@ def image(
     paths: Annotated[list[Path], typer.Argument(metavar='PATH', help='Image files, or folders of them.')],
     parameters: Parameters,
     out: Out = Path('line_features'),
+    stages: Annotated[bool, typer.Option('--stages', help='Write a picture of what each step made, too.')] = False,
 ) -> None:
     """Extract the segments of image files: an overlay picture (PNG) and a table (CSV) of each.
 
@@ -70,7 +73,7 @@ def image(
     found = files.find_images(paths)
     if not found:
         _fail(f'no image files in {", ".join(map(str, paths))}')
-    outcomes = _process(found, out, parameters)
+    outcomes = _process(found, out, parameters, stages=stages)
     done = [outcome for outcome in outcomes if not outcome.error]
     if done:
         _console.print(_table_of_steps(done))
@@ -78,12 +81,13 @@ def image(
     raise typer.Exit(0 if len(done) == len(outcomes) else 1 if done else 2)
 
 
-def _process(paths: list[Path], out: Path, parameters: Parameters) -> list[files.Outcome]:
+def _process(paths: list[Path], out: Path, parameters: Parameters, *, stages: bool = False) -> list[files.Outcome]:
     """Process files with a progress bar on a terminal, a line for each, and errors on standard error."""
     outcomes = []
     try:
         with Progress(console=_console, transient=True, disable=not _console.is_terminal) as progress:
-            for outcome in progress.track(files.process(paths, out, parameters), total=len(paths), description=''):
+            run = files.process(paths, out, parameters, stages=stages)
+            for outcome in progress.track(run, total=len(paths), description=''):
                 outcomes.append(outcome)
                 if outcome.error:
                     _errors.print(f'{outcome.path}: {outcome.error}', markup=False)
@@ -112,6 +116,41 @@ def _table_of_steps(outcomes: list[files.Outcome]) -> Table:
 
 @app.command()
 @_with_parameters
+def compare(
+    parameters: Parameters,
+    path: Annotated[Path | None, typer.Argument(metavar='IMAGE', help='Image file; a rendered corridor without.')]
+    = None,
+    out: Out = Path('line_features'),
+) -> None:
+    """Compare ways of thinning edges and of fitting lines, as section 3 of the paper does: the six panels of Fig. 5.
+
+    Without an image, on rendered corridors, the errors of each combination are measured against the ground truth.
+    """
+    try:
+        image = scenes.corridor().image if path is None else decode(path.read_bytes())
+        panels = section3.compare_pictures(files.displayable(image, parameters), parameters)
+        out.mkdir(parents=True, exist_ok=True)
+        target = out / f'{"corridor" if path is None else path.stem}-section3.png'
+        files.write_picture(target, sheet(panels, columns=2))
+    except OSError as error:
+        _fail(f'{error.filename}: {error.strerror}')
+    except (TypeError, ValueError) as error:
+        _fail(f'{path}: {error}')
+    if path is None:
+        _console.print(_table_of_errors(section3.measure_errors(parameters)))
+    _console.print(f'panels: {target}', markup=False)
+
+
+def _table_of_errors(rows: list[section3.Errors]) -> Table:
+    table = Table('thinning', 'orientation', 'precision', 'recall', 'angle', 'offset')
+    for row in rows:
+        table.add_row(row.thinning, row.orientation, f'{row.precision:.3f}', f'{row.recall:.3f}',
+                      f'{np.degrees(row.angle):.3f}°', f'{row.offset:.3f} px')
+    return table
+
+
+@app.command()
+@_with_parameters
 def demo(parameters: Parameters, out: Out = Path('demo')) -> None:
     """Render a corridor as a robot's camera sees it, extract its segments and hold them against the truth."""
     scene = scenes.corridor()
@@ -125,8 +164,7 @@ def demo(parameters: Parameters, out: Out = Path('demo')) -> None:
     if outcome.segments is None:
         _fail(outcome.error)
     _console.print(_table_of_steps([outcome]), _table_of_segments(outcome.segments))
-    ends = np.stack([outcome.segments[name] for name in ('x1', 'y1', 'x2', 'y2')], -1).astype(float)
-    agreement = truth.compare(ends, scene.truth, scene.weak)
+    agreement = truth.compare(end_points(outcome.segments), scene.truth, scene.weak)
     _console.print(f'against the ground truth: precision {agreement.precision:.2f}, recall {agreement.recall:.2f}, '
                    f'orientation within {np.degrees(agreement.angle):.2f}° and position within '
                    f'{agreement.offset:.2f} px (medians)')

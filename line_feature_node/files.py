@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, Parameters
 from line_feature_node.core.edges import intensity_map
+from line_feature_node.figures import sheet, stage_pictures
 from line_feature_node.images import decode
 from line_feature_node.overlay import draw_overlay
 
@@ -55,13 +56,16 @@ def find_images(paths: Iterable[Path]) -> list[Path]:
     return found
 
 
-def process(paths: list[Path], out: Path, parameters: Parameters, workers: int | None = None) -> Iterator[Outcome]:
+def process(
+    paths: list[Path], out: Path, parameters: Parameters, *, stages: bool = False, workers: int | None = None,
+) -> Iterator[Outcome]:
     """Extract the segments of files, as many at a time as there are processors; outcomes come in the files' order.
 
     Args:
         paths: The files.
         out: Folder for the results, made if need be.
         parameters: Of the extraction.
+        stages: Whether to write a picture of each step, and all of them on one sheet.
         workers: Files at a time; None for the number of processors.
 
     Raises:
@@ -75,7 +79,10 @@ def process(paths: list[Path], out: Path, parameters: Parameters, workers: int |
             of_thread.extractor = LineFeatureExtractor(parameters)
             # The first frame is the first to touch the extractor's memory: that is not the time to report.
             _process(path, out / name, of_thread.extractor)
-        return _process(path, out / name, of_thread.extractor)
+        outcome = _process(path, out / name, of_thread.extractor)
+        if stages and not outcome.error:
+            _write_stages(path, out / name, of_thread.extractor)
+        return outcome
 
     # Compiled once, before threads compete for it.
     LineFeatureExtractor(parameters).warm_up()
@@ -104,7 +111,7 @@ def _process(path: Path, target: Path, extractor: LineFeatureExtractor) -> Outco
         times = dict(extractor.times)
         caption = f'{len(segments)} segments, {sum(times.values()) * 1e3:.1f} ms'
         overlay, table = target.with_name(f'{target.name}-overlay.png'), target.with_name(f'{target.name}-segments.csv')
-        _write_picture(overlay, draw_overlay(displayable(image, extractor.parameters), segments, caption))
+        write_picture(overlay, draw_overlay(displayable(image, extractor.parameters), segments, caption))
         _write_table(table, segments)
     except OSError as error:
         return Outcome(path, error=error.strerror or str(error))
@@ -112,6 +119,14 @@ def _process(path: Path, target: Path, extractor: LineFeatureExtractor) -> Outco
         return Outcome(path, error=str(error))
     return Outcome(path, width=image.shape[1], height=image.shape[0], segments=segments, unlinked=extractor.unlinked,
                    times=times, overlay=overlay, table=table)
+
+
+def _write_stages(path: Path, target: Path, extractor: LineFeatureExtractor) -> None:
+    image = decode(path.read_bytes())
+    pictures = stage_pictures(displayable(image, extractor.parameters), extractor.stages(image))
+    for number, (name, picture) in enumerate(pictures.items()):
+        write_picture(target.with_name(f'{target.name}-{number}-{name}.png'), picture)
+    write_picture(target.with_name(f'{target.name}-stages.png'), sheet(pictures, columns=4))
 
 
 def displayable(image: NDArray[Any], parameters: Parameters) -> NDArray[np.uint8]:
@@ -122,7 +137,8 @@ def displayable(image: NDArray[Any], parameters: Parameters) -> NDArray[np.uint8
     return np.clip(scale * image + offset, 0, 255).astype(np.uint8)
 
 
-def _write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
+def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write a BGR picture as a PNG; OSError where that cannot be."""
     path.write_bytes(cv2.imencode('.png', picture)[1].tobytes())
 
 

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from line_feature_node.core import end_points
+
 #: Colours (BGR) of the direction codes 1 to 4, told apart by colour-blind eyes too (after Okabe and Ito).
 COLOURS = {1: (0, 94, 213), 2: (115, 158, 0), 3: (233, 180, 86), 4: (66, 228, 240)}
 #: Brightness that is left of the picture, so that the segments stand out.
@@ -26,7 +28,7 @@ def draw_overlay(image: NDArray[Any], segments: NDArray[np.void], caption: str =
         H×W×3 uint8, BGR; a new array.
     """
     canvas = np.asarray(cv2.convertScaleAbs(_bgr_of_grey(image), alpha=BACKGROUND), np.uint8)
-    ends = np.stack([segments[name] for name in ('x1', 'y1', 'x2', 'y2')], -1).astype(float)
+    ends = end_points(segments)
     thickness = max(1, round(max(canvas.shape[:2]) / 900))
     points = np.round(ends * 2**SHIFT).astype(int)
     for (x1, y1, x2, y2), code in zip(points.tolist(), segments['code'].tolist(), strict=True):

@@ -122,6 +122,27 @@ def test_sixteen_bits_and_colour(run, tmp_path):
     assert overlay[50, 30].max() < overlay[50, 100].min()
 
 
+def test_stages_are_written_beside_the_overlay(run, photo, tmp_path):
+    result = run('image', photo, '--out', tmp_path / 'out', '--stages')
+    assert result.exit_code == 0, result.output
+    names = sorted(path.name for path in (tmp_path / 'out').glob('photo-*'))
+    assert len(names) == 11
+    assert {'photo-1-edges.png', 'photo-5-blobs.png', 'photo-stages.png'} <= set(names)
+
+
+def test_compare_draws_the_panels_of_an_image(run, photo, tmp_path):
+    result = run('compare', photo, '--out', tmp_path / 'out')
+    assert result.exit_code == 0, result.output
+    assert cv2.imread(str(tmp_path / 'out' / 'photo-section3.png')) is not None
+    assert 'suppression' not in result.output
+
+
+def test_compare_of_a_bad_file_is_one_sentence(run, tmp_path):
+    result = run('compare', tmp_path / 'missing.png', '--out', tmp_path / 'out')
+    assert result.exit_code == 2
+    assert result.stderr == f'{tmp_path}/missing.png: No such file or directory\n'
+
+
 def test_the_demo_finds_the_corridor(run, tmp_path):
     result = run('demo', '--out', tmp_path, '--profile', 'paper')
     assert result.exit_code == 0, result.output

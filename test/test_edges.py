@@ -20,10 +20,13 @@ from line_feature_node.core.edges import (
 from line_feature_node.core.parameters import Parameters
 
 Floats = npt.NDArray[np.floating[Any]]
-OPERATORS: list[dict[str, Any]] = [
-    {'operator': 'sobel'}, *({'operator': 'deriche', 'alpha': alpha} for alpha in (0.2, 0.7, 1.0, 1.8, 5.0)),
+USUAL: list[dict[str, Any]] = [
+    *({'operator': operator} for operator in ('sobel', 'prewitt', 'scharr', 'dog')),
+    *({'operator': 'deriche', 'alpha': alpha} for alpha in (0.7, 1.0, 1.8)),
 ]
-USUAL = OPERATORS[:1] + OPERATORS[2:5]
+OPERATORS = [*USUAL, *({'operator': 'deriche', 'alpha': alpha} for alpha in (0.2, 5.0))]
+#: Smoothing across the derivative [-1 0 1].
+STENCIL_SMOOTHING = {'sobel': [1.0, 2, 1], 'prewitt': [1.0, 1, 1], 'scharr': [3.0, 10, 3]}
 SIZES = [1, 2, 3, 5, 7, 8, 15, 16, 17, 31, 32, 33, 40]
 
 
@@ -59,7 +62,7 @@ def gradient_of(
     """gx, gy and norm of each pixel, from the smoothed plane that the sweep leaves and with its kernels."""
     buffers = Shelf()
     marks_of(image, buffers, operator=operator, alpha=alpha)
-    plane = buffers.images['plane']
+    plane = buffers.images['smoothed' if operator == 'dog' else 'plane']
     stencil = deriche_stencil(alpha) if operator == 'deriche' else STENCILS[operator]
     side, centre = (np.float32(weight) for weight in stencil)
     across, along = np.zeros((2, plane.shape[1]), np.float32)
@@ -74,9 +77,14 @@ def gradient_of(
 
 def responses(operator: str, alpha: float = 1.0) -> tuple[Floats, Floats]:
     """Derivative and smoothing of an operator as weights of the pixels around one, by their definition."""
-    if operator == 'sobel':
-        derivative, smoothing = np.array([-1.0, 0, 1]), np.array([1.0, 2, 1])
+    if operator in STENCIL_SMOOTHING:
+        derivative, smoothing = np.array([-1.0, 0, 1]), np.array(STENCIL_SMOOTHING[operator])
         n = np.arange(-1, 2)
+    elif operator == 'dog':
+        # A Gaussian of one pixel, cut off at four, and the central difference of it.
+        n = np.arange(-5, 6)
+        smoothing = np.where(abs(n) <= 4, np.exp(-n * n / 2), 0)
+        derivative = np.convolve(smoothing, [1, 0, -1], 'same')
     else:
         n = np.arange(-math.ceil(30 / alpha), math.ceil(30 / alpha) + 1)
         derivative, smoothing = n * np.exp(-alpha * abs(n)), (alpha * abs(n) + 1) * np.exp(-alpha * abs(n))

@@ -15,7 +15,7 @@ def test_outcomes_come_in_order_with_any_number_of_workers(tmp_path):
     for k in range(12):
         paths.append(tmp_path / f'{k}.png')
         cv2.imwrite(str(paths[-1]), STEP[:, :70 + k])
-    runs = [list(process(paths, tmp_path / f'out{workers}', Parameters(), workers)) for workers in (1, 4)]
+    runs = [list(process(paths, tmp_path / f'out{workers}', Parameters(), workers=workers)) for workers in (1, 4)]
     for one, four in zip(*runs, strict=True):
         assert one.path == four.path
         assert one.segments.tobytes() == four.segments.tobytes()

@@ -192,6 +192,11 @@ def clip(first: float, last: float, start: float, step: float, size: float) -> t
     return min(max(first, low), high), min(max(last, low), high)
 
 
+def end_points(segments: NDArray[np.void]) -> NDArray[np.float64]:
+    """End points of SEGMENT_DTYPE records: N×4, x1, y1, x2, y2."""
+    return np.stack([segments[name] for name in ('x1', 'y1', 'x2', 'y2')], -1).astype(float)
+
+
 def segments_of(lines: NDArray[np.void], alive: NDArray[np.bool_], min_length: float) -> NDArray[np.void]:
     """The lines that are left as a new SEGMENT_DTYPE array, without those shorter than min_length."""
     segments = np.empty(np.count_nonzero(alive), SEGMENT_DTYPE)
