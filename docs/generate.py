@@ -1,4 +1,4 @@
-"""Write what the README shows: the table of parameters, and the picture of the demo's corridor.
+"""Write what the README and docs/ show: the table of parameters, and pictures of the demo's corridor.
 
     python docs/generate.py
 """
@@ -8,9 +8,12 @@ from pathlib import Path
 
 import cv2
 
-from line_feature_node.core import Parameters, extract
+from line_feature_node.core import LineFeatureExtractor, Parameters
+from line_feature_node.figures import sheet, stage_pictures
+from line_feature_node.files import write_picture
 from line_feature_node.overlay import draw_overlay
 from line_feature_node.scenes import corridor
+from line_feature_node.section3 import compare_pictures
 
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = '<!-- parameters: written by docs/generate.py -->', '<!-- end of parameters -->'
@@ -32,16 +35,20 @@ def with_table(readme: str) -> str:
     return pattern.sub(lambda _: f'{BEGIN}\n{parameter_table()}\n{END}', readme)
 
 
-def picture() -> bytes:
-    """The segments of the demo's corridor, as a PNG."""
-    image = corridor().image
-    return cv2.imencode('.png', draw_overlay(image, extract(image, profile='paper')))[1].tobytes()
+def write_pictures(folder: Path) -> None:
+    """The segments of the demo's corridor, what each step makes of it, and the panels of Fig. 5."""
+    image, parameters = corridor().image, Parameters.paper()
+    stages = LineFeatureExtractor(parameters).stages(image)
+    write_picture(folder / 'corridor.png', draw_overlay(image, stages.segments))
+    write_picture(folder / 'stages.png', sheet(stage_pictures(image, stages, scale=1), columns=2))
+    panels = sheet(compare_pictures(image, parameters), columns=2)
+    write_picture(folder / 'section3.png', cv2.resize(panels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
 def main() -> None:
     readme = ROOT / 'README.md'
     readme.write_text(with_table(readme.read_text(encoding='utf-8')), encoding='utf-8')
-    (ROOT / 'docs' / 'corridor.png').write_bytes(picture())
+    write_pictures(ROOT / 'docs')
 
 
 if __name__ == '__main__':

@@ -19,7 +19,7 @@ WIDTH = 960
 CAPTION = 26
 
 
-def stage_pictures(image: Picture, stages: Stages) -> dict[str, Picture]:
+def stage_pictures(image: Picture, stages: Stages, scale: int | None = None) -> dict[str, Picture]:
     """What each step made, by name and in order; BGR, enlarged by a whole number of times.
 
     `edges` has all edge pixels in white, those that only hysteresis keeps in grey; `chains` a colour for each chain,
@@ -29,6 +29,7 @@ def stage_pictures(image: Picture, stages: Stages) -> dict[str, Picture]:
     Args:
         image: H×W or H×W×3 uint8, for display.
         stages: What the steps made of it.
+        scale: How many times the pictures are enlarged; None for what makes single pixels visible.
     """
     shape = stages.grey.shape
     chains = np.repeat(np.arange(len(stages.chain_offsets) - 1), np.diff(stages.chain_offsets))
@@ -37,7 +38,7 @@ def stage_pictures(image: Picture, stages: Stages) -> dict[str, Picture]:
     chain_colours[stages.bridged[:len(chains)]] = 255
     edges = np.where(stages.strong, 255, 140) * (stages.edges != 0)
     blank = np.zeros(shape, np.uint8)
-    scale = enlargement(shape[1])
+    scale = scale or enlargement(shape[1])
     return {
         'image': draw_overlay(enlarged(image, scale), np.empty(0, stages.segments.dtype)),
         'edges': enlarged(cv2.cvtColor(edges.astype(np.uint8), cv2.COLOR_GRAY2BGR), scale),
