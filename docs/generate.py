@@ -10,7 +10,6 @@ import cv2
 
 from line_feature_node.core import LineFeatureExtractor, Parameters
 from line_feature_node.figures import sheet, stage_pictures
-from line_feature_node.files import write_picture
 from line_feature_node.overlay import draw_overlay
 from line_feature_node.scenes import corridor
 from line_feature_node.section3 import compare_pictures
@@ -39,10 +38,13 @@ def write_pictures(folder: Path) -> None:
     """The segments of the demo's corridor, what each step makes of it, and the panels of Fig. 5."""
     image, parameters = corridor().image, Parameters.paper()
     stages = LineFeatureExtractor(parameters).stages(image)
-    write_picture(folder / 'corridor.png', draw_overlay(image, stages.segments))
-    write_picture(folder / 'stages.png', sheet(stage_pictures(image, stages, scale=1), columns=2))
     panels = sheet(compare_pictures(image, parameters), columns=2)
-    write_picture(folder / 'section3.png', cv2.resize(panels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    for name, picture in {
+        'corridor': draw_overlay(image, stages.segments),
+        'stages': sheet(stage_pictures(image, stages, scale=1), columns=2),
+        'section3': cv2.resize(panels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA),
+    }.items():
+        (folder / f'{name}.jpg').write_bytes(cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
 
 
 def main() -> None:

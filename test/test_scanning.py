@@ -191,18 +191,18 @@ def test_visited_pixels_are_taken() -> None:
 @pytest.mark.parametrize(('code', 'pixels'), [
     (1, [(4, 1), (4, 2), (4, 3), (4, 4), (4, 5)]),
     (2, [(5, 1), (4, 2), (3, 3), (2, 4), (1, 5)]),
-    (3, [(6, 3), (5, 3), (4, 3), (3, 3), (2, 3)]),
-    (4, [(5, 5), (4, 4), (3, 3), (2, 2), (1, 1)]),
+    (3, [(2, 3), (3, 3), (4, 3), (5, 3), (6, 3)]),
+    (4, [(1, 1), (2, 2), (3, 3), (4, 4), (5, 5)]),
 ])
 @pytest.mark.parametrize('only', [None, 0, 2, 4])
 def test_where_a_chain_starts(code: int, pixels: list[Pixel], only: int | None) -> None:
-    """A line is walked down, to the lower left, left and upper left for codes 1 to 4, whichever pixel is strong."""
+    """A line is walked down, to the lower left, right and lower right for codes 1 to 4, whichever pixel is strong."""
     codes = drawn(pixels, code, (8, 9))
     strong = codes > 0 if only is None else drawn([pixels[only]], 1, (8, 9)) > 0
     [chain] = scan(codes, strong)
     assert chain.pixels == pixels
     assert chain.codes == [code] * 5
-    assert chain.directions == [code + 1] * 4 + [NONE]
+    assert chain.directions == [(code + 1) % 4] * 4 + [NONE]
     assert not chain.closed
 
 
