@@ -1,11 +1,23 @@
-# make install, demo, test, lint, bench: everything goes into .venv; nothing asks anything.
+# make install, demo, test, test-all, lint, colcon, bench: everything goes into .venv, or .venv-3.10 and so on for
+# test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Photographs to measure speed on, separated by spaces; without, the rendered corridor is used.
 PHOTOS ?=
+# opencv-contrib, which has EdgeDrawing, cannot be where OpenCV is.
+PEERS := .venv-peers
 
-.PHONY: install demo test lint bench readme clean
+# Docstring codes that ament_pep257 leaves out: its own convention forbids the summary on the first line, so ours is what
+# remains of all its codes without these.
+#   D105 D107       what __init__ and the like do is said by the class
+#   D203 D213       the other of two styles each; ours are D211 and D212
+#   D401            'The angle of ...' says more than 'Return the angle of ...'
+#   D406 D407 D413  sections of numpy's style; ours are Google's
+#   D417            arguments that belong together are described together
+PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
+
+.PHONY: install demo test test-all lint colcon bench docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -14,18 +26,31 @@ demo: install
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n auto
 
+# The tests on every Python from 3.10 up that is found.
+test-all:
+	.ci/test-all
+
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/ament_flake8 --config setup.cfg setup.py line_feature_node bench docs test
+	$(BIN)/ament_pep257 --ignore $(PEP257_IGNORE) -- setup.py line_feature_node
 
-bench: install
-	$(BIN)/python bench/speed.py $(PHOTOS)
+# Build, test and check the package as a colcon workspace has it; .ci/colcon says what is checked.
+colcon: $(VENV)/.colcon
+	.ci/colcon $(BIN)
 
-readme: install
-	$(BIN)/python bench/readme.py
+# Speed beside OpenCV's detectors, as a table, and two curves in bench/results.
+bench: $(PEERS)/.installed
+	$(PEERS)/bin/python bench/speed.py $(PHOTOS) --results bench/results
+	$(PEERS)/bin/python bench/cold_start.py
+
+# The table of parameters in the README, and the pictures in docs/.
+docs: install
+	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(PEERS) .venv-3.* build/colcon
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -34,10 +59,20 @@ $(VENV)/.installed: $(BIN)/python setup.py package.xml
 	$(BIN)/python -m pip install --quiet --editable .
 	touch $@
 
+$(PEERS)/.installed: bench/requirements.txt setup.py package.xml
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --requirement bench/requirements.txt
+	$(PEERS)/bin/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
 $(VENV)/.test: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[test]'
 	touch $@
 
 $(VENV)/.lint: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[lint]'
+	touch $@
+
+$(VENV)/.colcon: $(VENV)/.test
+	$(BIN)/python -m pip install --quiet --editable '.[colcon]'
 	touch $@

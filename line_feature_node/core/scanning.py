@@ -4,10 +4,10 @@ Directions are those of the chain code: 0 is +x, then in steps of 45 degrees fro
 
 Where a chain starts and how it is walked: the marks are read from the top, left to right, and the first strong pixel
 that no chain has yet is a seed. The chain runs through it along the edge, in the direction that its code gives (down,
-to the lower left, to the right and to the lower right for codes 1 to 4), and reaches as far as the edge goes both ways.
-At each pixel it goes on to the unvisited neighbour that bends least, by a right angle at most; of two that bend alike it
-takes the one that turns back, as a digital straight line does. What it leaves beside itself starts chains of its own, so
-all that is connected to a strong pixel is visited: that is the hysteresis.
+to the lower left, to the right and to the lower right for codes 1 to 4), and reaches as far as the edge goes both
+ways. At each pixel it goes on to the unvisited neighbour that bends least, by a right angle at most; of two that bend
+alike it takes the one that turns back, as a digital straight line does. What it leaves beside itself starts chains of
+its own, so all that is connected to a strong pixel is visited: that is the hysteresis.
 """
 
 from functools import lru_cache
