@@ -52,8 +52,9 @@ docs: install
 clean:
 	rm -rf $(VENV) $(PEERS) .venv-3.* build/colcon
 
+# Where Debian's python3-venv is missing, a folder without pip is left behind: it must not pass for an environment.
 $(BIN)/python:
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) && $@ -m pip --version >/dev/null || { rm -rf $(VENV); exit 1; }
 
 $(VENV)/.installed: $(BIN)/python setup.py package.xml
 	$(BIN)/python -m pip install --quiet --editable .

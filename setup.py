@@ -5,14 +5,15 @@ from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
-PACKAGE = ElementTree.parse(Path(__file__).parent / 'package.xml').getroot()
+HERE = Path(__file__).parent
+PACKAGE = ElementTree.parse(HERE / 'package.xml').getroot()
 NAME = PACKAGE.findtext('name')
 
 setup(
     name=NAME,
     version=PACKAGE.findtext('version'),
     description=' '.join(PACKAGE.findtext('description').split()),
-    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license=PACKAGE.findtext('license'),
     maintainer=PACKAGE.findtext('maintainer'),
@@ -26,7 +27,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     install_requires=[
-        'numba>=0.59', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'typer>=0.12',
+        'numba>=0.59', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'typer>=0.9',
     ],
     extras_require={
         # rclpy's wheel needs the extra to find a middleware.

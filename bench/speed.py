@@ -39,7 +39,10 @@ def pictures(paths: list[Path]) -> list[Any]:
     if not paths:
         return [cv2.cvtColor(corridor(Camera(x=x), width=1920, height=1080, seed=k).image, cv2.COLOR_BGR2GRAY)
                 for k, x in enumerate((2.0, 6.0, 10.0))]
-    images = [decode(path.read_bytes()) for path in paths]
+    try:
+        images = [decode(path.read_bytes()) for path in paths]
+    except (OSError, ValueError) as error:
+        raise SystemExit(f'not all of the photographs can be read: {error}') from None
     return [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image for image in images]
 
 

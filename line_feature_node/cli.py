@@ -1,9 +1,10 @@
 """The command `line_features`."""
 
+import importlib.metadata
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, Optional
 
 import cv2
 import numpy as np
@@ -18,8 +19,7 @@ from line_feature_node.figures import sheet
 from line_feature_node.images import decode
 
 app = typer.Typer(
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
-    help='Line segments from images, after "Extraction of line features in a noisy image" (1997).')
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 _console, _errors = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False, soft_wrap=True)
 
 #: The edges that a direction code stands for: its section of the gradient, and what lies across it.
@@ -44,12 +44,12 @@ def _with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     options: dict[str, tuple[type, str | None, str]] = {
         'profile': (str, 'default', f'Set of parameters to start from: {", ".join(PROFILES)}.')}
     for name, spec in Parameters.specs().items():
-        unit = f' {spec.unit}' if spec.unit else ''
+        unit = f' ({spec.unit})' if spec.unit else ''
         default = getattr(Parameters(), name)
         options[name] = (type(default), None, f'{spec.description} {spec.range}{unit}; default {default}.')
     added = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=typer.Option(default, f'--{name}', help=text),
-                          annotation=kind if default is not None else kind | None)
+                          annotation=kind if default is not None else Optional[kind])  # noqa: UP045  Typer 0.9, of apt
         for name, (kind, default, text) in options.items()]
     described = [*(signature.parameters[name] for name in kept), *added]
     run.__name__, run.__doc__ = command.__name__, command.__doc__
@@ -58,10 +58,25 @@ def _with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        _console.print(importlib.metadata.version('line_feature_node'))
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[bool, typer.Option(
+        '--version', help='Print the version.', is_eager=True, callback=_print_version)] = False,
+) -> None:
+    """Line segments from images, after "Extraction of line features in a noisy image" (1997)."""
+
+
 @app.command()
 @_with_parameters
 def image(
-    paths: Annotated[list[Path], typer.Argument(metavar='PATH', help='Image files, or folders of them.')],
+    paths: Annotated[list[Path], typer.Argument(
+        metavar='PATH', readable=False, help='Image files, or folders of them.')],
     parameters: Parameters,
     out: Out = Path('line_features'),
     stages: Annotated[bool, typer.Option('--stages', help='Write a picture of what each step made, too.')] = False,
@@ -70,14 +85,15 @@ def image(
 
     Ends with status 0 when all went well, 1 when some files failed and 2 when all did.
     """
-    found = files.find_images(paths)
-    if not found:
-        _fail(f'no image files in {", ".join(map(str, paths))}')
+    try:
+        found = files.find_images(paths)
+    except OSError as error:
+        _fail(f'{error.filename}: {error.strerror}')
     outcomes = _process(found, out, parameters, stages=stages)
     done = [outcome for outcome in outcomes if not outcome.error]
     if done:
         _console.print(_table_of_steps(done))
-        _console.print(f'{len(done)} of {len(outcomes)} files done; overlays and tables are in {out}')
+        _console.print(f'{len(done)} of {len(outcomes)} files done; overlays and tables are in {out}', markup=False)
     raise typer.Exit(0 if len(done) == len(outcomes) else 1 if done else 2)
 
 
@@ -93,6 +109,8 @@ def _process(paths: list[Path], out: Path, parameters: Parameters, *, stages: bo
                     _errors.print(f'{outcome.path}: {outcome.error}', markup=False)
                 else:
                     _console.print(_line_of(outcome), markup=False)
+                if outcome.hint:
+                    _errors.print(f'{outcome.path}: nothing found; {outcome.hint}', markup=False)
     except OSError as error:
         _fail(f'cannot write to {out}: {error.strerror}')
     return outcomes
@@ -100,7 +118,7 @@ def _process(paths: list[Path], out: Path, parameters: Parameters, *, stages: bo
 
 def _line_of(outcome: files.Outcome) -> str:
     linked = 0 if outcome.segments is None else len(outcome.segments)
-    return (f'{outcome.path}: {outcome.width}×{outcome.height}, {outcome.unlinked} segments, {linked} after linking, '
+    return (f'{outcome.path}: {outcome.width}x{outcome.height}, {outcome.unlinked} segments, {linked} after linking, '
             f'{sum(outcome.times.values()) * 1e3:.1f} ms')
 
 
@@ -118,8 +136,8 @@ def _table_of_steps(outcomes: list[files.Outcome]) -> Table:
 @_with_parameters
 def compare(
     parameters: Parameters,
-    path: Annotated[Path | None, typer.Argument(metavar='IMAGE', help='Image file; a rendered corridor without.')]
-    = None,
+    path: Annotated[Optional[Path], typer.Argument(  # noqa: UP045  as above
+        metavar='IMAGE', readable=False, help='Image file; a rendered corridor without.')] = None,
     out: Out = Path('line_features'),
 ) -> None:
     """Compare ways of thinning edges and of fitting lines, as section 3 of the paper does: the six panels of Fig. 5.
@@ -129,13 +147,13 @@ def compare(
     try:
         image = scenes.corridor().image if path is None else decode(path.read_bytes())
         panels = section3.compare_pictures(files.displayable(image, parameters), parameters)
-        out.mkdir(parents=True, exist_ok=True)
         target = out / f'{"corridor" if path is None else path.stem}-section3.png'
+        out.mkdir(parents=True, exist_ok=True)
         files.write_picture(target, sheet(panels, columns=2))
     except OSError as error:
         _fail(f'{error.filename}: {error.strerror}')
     except (TypeError, ValueError) as error:
-        _fail(f'{path}: {error}')
+        _fail(str(error) if path is None else f'{path}: {error}')
     if path is None:
         _console.print(_table_of_errors(section3.measure_errors(parameters)))
     _console.print(f'panels: {target}', markup=False)
@@ -145,7 +163,7 @@ def _table_of_errors(rows: list[section3.Errors]) -> Table:
     table = Table('thinning', 'orientation', 'precision', 'recall', 'angle', 'offset')
     for row in rows:
         table.add_row(row.thinning, row.orientation, f'{row.precision:.3f}', f'{row.recall:.3f}',
-                      f'{np.degrees(row.angle):.3f}°', f'{row.offset:.3f} px')
+                      f'{np.degrees(row.angle):.3f} deg', f'{row.offset:.3f} px')
     return table
 
 
@@ -162,12 +180,15 @@ def demo(parameters: Parameters, out: Out = Path('demo')) -> None:
         _fail(f'cannot write to {out}: {error.strerror}')
     [outcome] = _process([picture], out, parameters)
     if outcome.segments is None:
-        _fail(outcome.error)
+        raise typer.Exit(2)
     _console.print(_table_of_steps([outcome]), _table_of_segments(outcome.segments))
     agreement = truth.compare(end_points(outcome.segments), scene.truth, scene.weak)
-    _console.print(f'against the ground truth: precision {agreement.precision:.2f}, recall {agreement.recall:.2f}, '
-                   f'orientation within {np.degrees(agreement.angle):.2f}° and position within '
-                   f'{agreement.offset:.2f} px (medians)')
+    if agreement.recall > 0:
+        _console.print(f'against the ground truth: precision {agreement.precision:.2f}, recall {agreement.recall:.2f}, '
+                       f'orientation within {np.degrees(agreement.angle):.2f} degrees and position within '
+                       f'{agreement.offset:.2f} px (medians)')
+    else:
+        _console.print('against the ground truth: nothing of it was found')
     _console.print(f'table:   {outcome.table}\noverlay: {outcome.overlay}', markup=False)
 
 

@@ -19,6 +19,14 @@ from line_feature_node.figures import sheet, stage_pictures
 from line_feature_node.images import decode
 from line_feature_node.overlay import draw_overlay
 
+#: Files that are taken for images by their name, so that broken ones are reported.
+SUFFIXES = {'.avif', '.bmp', '.exr', '.gif', '.hdr', '.jp2', '.jpeg', '.jpg', '.pbm', '.pgm', '.png', '.pnm', '.ppm',
+            '.tif', '.tiff', '.webp'}
+#: How the name of an overlay ends.
+OVERLAY = '-overlay.png'
+#: Grey levels between the darkest and the brightest pixel of a picture that uses hardly any of its range.
+FAINT = 16.0
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -32,6 +40,7 @@ class Outcome:
         unlinked: Number of segments before linking.
         times: Seconds of each step.
         overlay, table: The files that were written.
+        hint: One sentence on why there may be no segments; '' where there are.
     """
 
     path: Path
@@ -43,17 +52,25 @@ class Outcome:
     times: dict[str, float] = field(default_factory=dict)
     overlay: Path | None = None
     table: Path | None = None
+    hint: str = ''
 
 
 def find_images(paths: Iterable[Path]) -> list[Path]:
-    """The files themselves, and of folders those files in it that OpenCV can read."""
+    """The files themselves, and of folders those files in it that are images by name or content.
+
+    What an earlier run wrote is left out; a folder without images stands for itself, to be reported as such.
+    """
     found = []
     for path in paths:
-        if path.is_dir():
-            found += sorted(file for file in path.iterdir() if file.is_file() and cv2.haveImageReader(str(file)))
-        else:
-            found.append(path)
+        inside = []
+        if os.path.isdir(path):
+            inside = sorted(file for file in path.iterdir() if _is_image(file) and not file.name.endswith(OVERLAY))
+        found += inside or [path]
     return found
+
+
+def _is_image(file: Path) -> bool:
+    return file.is_file() and (file.suffix.lower() in SUFFIXES or cv2.haveImageReader(str(file)))
 
 
 def process(
@@ -75,17 +92,11 @@ def process(
     of_thread = threading.local()
 
     def work(path: Path, name: str) -> Outcome:
-        if not hasattr(of_thread, 'extractor'):
+        new = not hasattr(of_thread, 'extractor')
+        if new:
             of_thread.extractor = LineFeatureExtractor(parameters)
-            # The first frame is the first to touch the extractor's memory: that is not the time to report.
-            _process(path, out / name, of_thread.extractor)
-        outcome = _process(path, out / name, of_thread.extractor)
-        if stages and not outcome.error:
-            _write_stages(path, out / name, of_thread.extractor)
-        return outcome
+        return _process(path, out / name, of_thread.extractor, stages=stages, again=new)
 
-    # Compiled once, before threads compete for it.
-    LineFeatureExtractor(parameters).warm_up()
     with ThreadPoolExecutor(workers or os.cpu_count()) as executor:
         yield from executor.map(work, paths, _names(paths))
 
@@ -104,25 +115,59 @@ def _names(paths: list[Path]) -> list[str]:
     return names
 
 
-def _process(path: Path, target: Path, extractor: LineFeatureExtractor) -> Outcome:
+def _process(path: Path, target: Path, extractor: LineFeatureExtractor, *, stages: bool, again: bool) -> Outcome:
+    """Extract and write; `again` for the first frame, whose time would be that of compiling and of new memory."""
     try:
-        image = decode(path.read_bytes())
+        image = _read(path)
         segments = extractor.extract(image)
-        times = dict(extractor.times)
-        caption = f'{len(segments)} segments, {sum(times.values()) * 1e3:.1f} ms'
-        overlay, table = target.with_name(f'{target.name}-overlay.png'), target.with_name(f'{target.name}-segments.csv')
-        write_picture(overlay, draw_overlay(displayable(image, extractor.parameters), segments, caption))
-        _write_table(table, segments)
+        if again:
+            segments = extractor.extract(image)
     except OSError as error:
         return Outcome(path, error=error.strerror or str(error))
     except (TypeError, ValueError) as error:
         return Outcome(path, error=str(error))
-    return Outcome(path, width=image.shape[1], height=image.shape[0], segments=segments, unlinked=extractor.unlinked,
-                   times=times, overlay=overlay, table=table)
+    outcome = Outcome(
+        path, width=image.shape[1], height=image.shape[0], segments=segments, unlinked=extractor.unlinked,
+        times=dict(extractor.times), overlay=target.with_name(target.name + OVERLAY),
+        table=target.with_name(f'{target.name}-segments.csv'), hint=_hint(image, segments, extractor.parameters))
+    try:
+        _write(outcome, image, extractor)
+        if stages:
+            _write_stages(image, target, extractor)
+    except OSError as error:
+        return Outcome(path, error=f'cannot write {error.filename}: {error.strerror}')
+    return outcome
 
 
-def _write_stages(path: Path, target: Path, extractor: LineFeatureExtractor) -> None:
-    image = decode(path.read_bytes())
+def _read(path: Path) -> NDArray[Any]:
+    """An image file as an array; OSError or ValueError where that cannot be."""
+    if os.path.isdir(path):
+        raise ValueError('no image files in this folder')
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise ValueError('not a regular file')
+    return decode(path.read_bytes())
+
+
+def _hint(image: NDArray[Any], segments: NDArray[np.void], parameters: Parameters) -> str:
+    """What may be wrong where nothing was found in a picture that uses hardly any of its range of intensities."""
+    scale, _ = intensity_map(image.dtype, parameters)
+    spread = float(image.max()) - float(image.min())
+    if len(segments) or spread == 0 or scale * spread > FAINT:
+        return ''
+    return (f'pixels from {image.min():g} to {image.max():g} are {scale * spread / 255:.1%} of the range: '
+            f'intensity_min and intensity_max say what is black and white')
+
+
+def _write(outcome: Outcome, image: NDArray[Any], extractor: LineFeatureExtractor) -> None:
+    assert outcome.overlay is not None
+    assert outcome.table is not None
+    assert outcome.segments is not None
+    picture = displayable(image, extractor.parameters)
+    write_picture(outcome.overlay, draw_overlay(picture, outcome.segments, f'{len(outcome.segments)} segments'))
+    _write_table(outcome.table, outcome.segments)
+
+
+def _write_stages(image: NDArray[Any], target: Path, extractor: LineFeatureExtractor) -> None:
     pictures = stage_pictures(displayable(image, extractor.parameters), extractor.stages(image))
     for number, (name, picture) in enumerate(pictures.items()):
         write_picture(target.with_name(f'{target.name}-{number}-{name}.png'), picture)
@@ -131,9 +176,9 @@ def _write_stages(path: Path, target: Path, extractor: LineFeatureExtractor) -> 
 
 def displayable(image: NDArray[Any], parameters: Parameters) -> NDArray[np.uint8]:
     """The image with its range of intensities brought to bytes."""
-    if image.dtype == np.uint8:
-        return image
     scale, offset = intensity_map(image.dtype, parameters)
+    if image.dtype == np.uint8 and (scale, offset) == (1, 0):
+        return image
     return np.clip(scale * image + offset, 0, 255).astype(np.uint8)
 
 

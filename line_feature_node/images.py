@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-#: How a complete file of a format ends, by how it begins; OpenCV fills in what is missing of others with grey.
-ENDINGS = {b'\xff\xd8': b'\xff\xd9', b'\x89PNG': b'IEND\xaeB`\x82'}
+JPEG, JPEG_SCAN, JPEG_END = b'\xff\xd8\xff', 0xDA, b'\xff\xd9'
+PNG, PNG_END = b'\x89PNG', b'IEND\xaeB`\x82'
 
 
 def decode(data: bytes) -> NDArray[Any]:
@@ -21,10 +21,8 @@ def decode(data: bytes) -> NDArray[Any]:
     """
     if not data:
         raise ValueError('no data: expected a compressed image')
-    for beginning, ending in ENDINGS.items():
-        # Some cameras add bytes of padding, editors whole blocks of their own: the end may lie before the last byte.
-        if data.startswith(beginning) and ending not in data:
-            raise ValueError(f'a part of an image: {len(data)} bytes without the end of the picture')
+    if not _is_whole(data):
+        raise ValueError(f'a part of an image: {len(data)} bytes without the end of the picture')
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error as error:
@@ -32,3 +30,21 @@ def decode(data: bytes) -> NDArray[Any]:
     if image is None:
         raise ValueError('not an image that OpenCV can decode')
     return np.asarray(image)
+
+
+def _is_whole(data: bytes) -> bool:
+    """False for a JPEG or PNG whose end is missing; some versions of OpenCV fill in grey for what does.
+
+    Cameras add padding and editors blocks of their own, so the end may lie before the last byte.
+    """
+    if data.startswith(JPEG):
+        return JPEG_END in data[_first_scan(data):]
+    return not data.startswith(PNG) or PNG_END in data
+
+
+def _first_scan(data: bytes) -> int:
+    """Where the picture itself begins in a JPEG: behind its header, which may hold a thumbnail, an image of its own."""
+    place = 2
+    while place + 4 <= len(data) and data[place] == 0xFF and data[place + 1] != JPEG_SCAN:
+        place += 2 + int.from_bytes(data[place + 2:place + 4], 'big')
+    return place

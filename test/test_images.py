@@ -30,3 +30,14 @@ def test_truncated_is_an_error_and_not_a_grey_picture(ending, share):
 def test_what_is_no_image_is_said_to_be_none(data):
     with pytest.raises(ValueError, match=r'no data|not an image'):
         decode(data)
+
+
+def test_the_end_of_a_thumbnail_is_not_the_end_of_the_picture():
+    """An EXIF block holds a JPEG of its own, before the picture."""
+    data = cv2.imencode('.jpg', PICTURE)[1].tobytes()
+    thumbnail = b'Exif\0\0' + cv2.imencode('.jpg', PICTURE[:8, :8])[1].tobytes()
+    block = b'\xff\xe1' + (len(thumbnail) + 2).to_bytes(2, 'big') + thumbnail
+    whole = data[:2] + block + data[2:]
+    np.testing.assert_array_equal(decode(whole), decode(data))
+    with pytest.raises(ValueError, match='a part of an image'):
+        decode(whole[:-100])

@@ -68,7 +68,9 @@ def test_core_knows_nothing_of_the_world(path):
     allowed = {'cv2', 'numpy', 'numba', 'llvmlite', *sys.stdlib_module_names}
     for name in imports(path):
         assert name.startswith('line_feature_node.core') or name.split('.')[0] in allowed, name
-        assert name.split('.')[0] not in {'argparse', 'pathlib', 'os', 'io', 'logging'}, name
+        assert name.split('.')[0] not in {'argparse', 'os', 'io', 'logging'}, name
+        # The cache of compiled kernels goes by what the modules of the core are.
+        assert name != 'pathlib' or path.name == 'compiling.py'
 
 
 def test_modules_and_tests_have_the_same_names():

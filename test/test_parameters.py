@@ -101,7 +101,7 @@ def test_float_for_a_whole_number_is_refused(name: str, value: float) -> None:
 @pytest.mark.parametrize('kind', [int, float, np.float32, np.float64, np.int32, np.uint8])
 def test_numbers_of_any_type(name: str, kind: type) -> None:
     """Whole numbers and numpy's scalars will do for a number, which is kept as a float."""
-    value = {'alpha': 2, 'sigma': 2, 'T2': 4, 'intensity_max': 100}.get(name, 50)
+    value = {'alpha': 2, 'sigma': 2, 'T2': 4, 'intensity_max': 100, 'tau1': 9}.get(name, 50)
     given = kind(value)
     kept = getattr(Parameters(**{name: given}), name)
     assert kept == value

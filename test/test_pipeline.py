@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -365,6 +366,44 @@ def test_frames_do_not_depend_on_those_before(parameters: Parameters) -> None:
         assert same(extractor.extract(frames()[k]), expected[k]), k
 
 
+@pytest.mark.parametrize('thinning', Parameters.specs()['thinning'].choices)
+def test_images_of_one_padded_width_do_not_mix(thinning: str) -> None:
+    """Rows are padded to whole words: what a wider image left in the padding must not be seen."""
+    extractor = LineFeatureExtractor(Parameters(thinning=thinning, min_chain=2))
+    noise = np.random.default_rng(0).integers(0, 256, (30, 46), np.uint8)
+    for width in range(46, 30, -1):
+        extractor.extract(noise)
+        image = np.ascontiguousarray(noise[:, :width])
+        fresh = LineFeatureExtractor(extractor.parameters).extract(image)
+        assert same(extractor.extract(image), fresh)
+
+
+def test_one_extractor_in_two_threads_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would write into the memory of the other; afterwards it goes on."""
+    extractor = LineFeatureExtractor()
+    expected = extractor.extract(scene())
+    refused = []
+
+    def second(*_: Any) -> None:
+        try:
+            extractor.extract(scene())
+        except RuntimeError as error:
+            refused.append(str(error))
+
+    monkeypatch.setattr(extractor, '_steps', lambda *_: second())
+    extractor.extract(scene())
+    monkeypatch.undo()
+    assert refused == ['the extractor is at work in another thread: each thread needs an extractor of its own']
+    assert same(extractor.extract(scene()), expected)
+
+
+def test_warm_up_leaves_out_types_that_the_range_contradicts() -> None:
+    extractor = LineFeatureExtractor(Parameters(intensity_min=300))
+    extractor.warm_up()
+    with pytest.raises(ValueError, match='intensity_min must be less than intensity_max'):
+        extractor.warm_up(np.uint8)
+
+
 def test_results_are_not_overwritten() -> None:
     extractor = LineFeatureExtractor()
     first = extractor.extract(scene())
@@ -615,8 +654,8 @@ def check_everything(image: Image, parameters: Parameters) -> Stages:
     check_chains(stages, parameters)
     check_blobs(stages)
     check_moments(stages, parameters)
-    for segments in (stages.unlinked, stages.segments):
-        check_segments(segments, height, width, parameters)
+    check_segments(stages.unlinked, height, width, dataclasses.replace(parameters, min_length=0))
+    check_segments(stages.segments, height, width, parameters)
     return stages
 
 
@@ -689,8 +728,8 @@ parameter_sets = st.builds(
     operator=st.sampled_from(Parameters.specs()['operator'].choices), alpha=st.floats(0.2, 5), sigma=st.floats(0.3, 10),
     thinning=st.sampled_from(['suppression', *Parameters.specs()['thinning'].choices]), max_gap=st.integers(0, 8),
     min_chain=st.integers(1, 12), n=st.integers(0, 12) | st.integers(0, 10000), min_size=st.integers(2, 12),
-    orientation=st.sampled_from(['principal_axis', 'least_squares']), tau1=st.floats(0, 5) | st.floats(0, 1000),
-    tau2=st.floats(0, 20) | st.floats(0, 1000), min_length=st.just(0.0) | st.floats(0, 30),
+    orientation=st.sampled_from(['principal_axis', 'least_squares']), tau1=st.floats(0, 5) | st.floats(0, 20),
+    tau2=st.floats(0, 20) | st.floats(0, 100), min_length=st.just(0.0) | st.floats(0, 30),
     intensity_min=st.just(math.nan) | st.floats(-100, 100), intensity_max=st.just(math.nan) | st.floats(101, 255))
 
 

@@ -7,7 +7,7 @@ from numpy.typing import DTypeLike, NDArray
 
 
 class Buffers:
-    """Arrays by name, each as large as the largest frame so far needed it.
+    """Arrays by name. Lists are as long as the largest frame so far needed them, images as large as the last frame.
 
     What an array holds at first is unspecified, but for those asked for with ``zeros``: their users leave them as
     they found them, all zero.

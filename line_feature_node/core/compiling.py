@@ -1,6 +1,8 @@
 """How the kernels are compiled: Numba, without the GIL, cached where a folder can be written."""
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -25,6 +27,23 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     options |= {'nogil': True, 'fastmath': {'contract'}, 'error_model': 'numpy'}
     try:
-        return numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError:
         return numba.njit(**options)(function)
+    # Numba takes cached code for current while the file of its function is unchanged; but ours has functions and
+    # constants of other modules compiled into it. So the stamp of that file becomes one of all of them.
+    cache_file: Any = getattr(getattr(compiled, '_cache', None), '_cache_file', None)
+    if hasattr(cache_file, '_source_stamp'):
+        cache_file._source_stamp = SOURCES
+    return compiled
+
+
+def _sources() -> str:
+    """A digest of all modules of the core."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob('*.py')):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+SOURCES = _sources()

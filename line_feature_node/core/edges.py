@@ -63,6 +63,8 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     plane = buffers.image('plane', lines + 2 * PAD, columns, np.float32)
     rows = buffers.image('rows', 12, columns, np.float32)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
+    # An image of another width may have had the same padded one, and pixels where the padding is now.
+    marks[:, MARGIN + width:] = 0
     scale, offset = intensity_map(image.dtype, parameters)
     q = math.exp(-parameters.alpha)
     recursive = parameters.operator == 'deriche'
@@ -291,7 +293,9 @@ def suppress(
     dividing. It stays when greater than both.
 
     A tie is won by its first pixel: forward may be equal, backward not. That holds for codes 1 and 3. Of a diagonal
-    tie neither pixel stays: the two touch at a corner, and between the other two pixels there runs the ridge.
+    tie neither pixel stays: the two touch at a corner, and between the other two pixels there runs the ridge. Where it
+    runs between diagonal neighbours' sides instead, along a 45 degree edge between pixels, both sides of it stay: they
+    touch each other, but the pixels one step along the gradient from each are lower.
     """
     for i in range(marks.size):
         j = i + PAD

@@ -87,7 +87,7 @@ def falls_on(first: Any, second: Any) -> bool:
     return min(second['y1'], second['y2']) <= y3 <= max(second['y1'], second['y2'])
 
 
-@kernel
+@inlined
 def adjacent(first: Any, second: Any, tau2: float) -> bool:
     """Definition 3: the smallest distance between end points of the two lines is below tau2."""
     return nearest_ends(first, second)[0] < tau2
@@ -230,11 +230,11 @@ def find_pairs(
                     # Of the up to four ways to meet a pair here, its nearest ends are the one that counts.
                     if alive[other] and is_near(line, end, lines[other], entry % 2, tau2):
                         gap, ends = nearest_ends(line, lines[other])
-                        if (gap >= tau2 or ends != 2 * end + entry % 2 or not collinear(line, lines[other], tau1)
-                                or overlapped(line, lines[other])):
+                        if not (ends == 2 * end + entry % 2 and adjacent(line, lines[other], tau2)
+                                and collinear(line, lines[other], tau1) and not overlapped(line, lines[other])):
                             entry = entries[entry]
                             continue
-                        if found == gaps.size or found == pairs.shape[0]:
+                        if found == pairs.shape[0]:
                             return -1, waiting
                         swapped = precedes(line, lines[other]) > 0
                         pairs[found, 0], pairs[found, 1] = (other, k) if swapped else (k, other)

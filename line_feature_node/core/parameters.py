@@ -83,11 +83,12 @@ class Parameters:
         choices=('principal_axis', 'least_squares'))
     tau1: float = _parameter(
         1.0, 'Linked segments have their mid-points nearer than this to the line of the other.',
-        low=0.0, high=1000.0, unit='pixels')
+        low=0.0, high=20.0, unit='pixels')
     tau2: float = _parameter(
         6.0, 'Linked segments have two end points nearer than this to each other.',
-        low=0.0, high=1000.0, unit='pixels')
-    min_length: float = _parameter(0.0, 'Shorter segments are dropped after linking.', low=0.0, high=1e6, unit='pixels')
+        low=0.0, high=100.0, unit='pixels')
+    min_length: float = _parameter(
+        0.0, 'Shorter segments are dropped after linking.', low=0.0, high=100000.0, unit='pixels')
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

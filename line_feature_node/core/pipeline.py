@@ -1,5 +1,6 @@
 """The six steps in their order: an image comes in, segments go out."""
 
+import contextlib
 import copy
 import threading
 import time
@@ -50,10 +51,11 @@ class Stages:
         closed: bool, which chains are closed.
         bridged: bool, which pixels fill a gap.
         codes_before, codes_after: Codes of the chains' pixels before and after edge normalisation.
-        blobs: BLOB_DTYPE, the attributes of Fig. 13 of each line-blob.
+        blobs: BLOB_DTYPE, the attributes of Fig. 13 of each label; those with `select` are the line-blobs, the others
+            merged into them and are empty.
         blob_pixels: Pixels of the line-blobs.
         blob_offsets: int32, where each blob starts.
-        unlinked: SEGMENT_DTYPE, segments before linking.
+        unlinked: SEGMENT_DTYPE, segments before linking; `min_length` applies after it.
         segments: SEGMENT_DTYPE, the result.
     """
 
@@ -78,11 +80,12 @@ class Stages:
 class LineFeatureExtractor:
     """Extracts line segments from images with one set of parameters.
 
-    Memory is kept between frames of one size, so use one extractor a thread. The kernels run without the GIL.
+    Memory is kept between frames, as much as the largest so far needed, so use one extractor a thread. The kernels run
+    without the GIL.
 
     Attributes:
         parameters: What it was made with.
-        times: Seconds that each of STEPS took in the last frame.
+        times: Seconds that each of STEPS took in the last frame that was extracted.
         unlinked: How many segments the last frame had before linking.
     """
 
@@ -93,6 +96,7 @@ class LineFeatureExtractor:
         self.times = dict.fromkeys(STEPS, 0.0)
         self.unlinked = 0
         self._buffers = Buffers()
+        self._busy = threading.Lock()
 
     def extract(self, image: NDArray[Any]) -> NDArray[np.void]:
         """Extract the line segments of an image.
@@ -107,6 +111,7 @@ class LineFeatureExtractor:
             TypeError: The image is no array or has another type of pixel.
             ValueError: The image has another shape, no pixels, or pixels that are NaN or infinite; or intensity_min or
                 intensity_max, of which only one is given, contradicts the type of the pixels.
+            RuntimeError: Another thread uses the extractor at this moment.
         """
         last = time.perf_counter()
 
@@ -122,10 +127,15 @@ class LineFeatureExtractor:
         """Compile the kernels, or load them from the cache, so that the first frame takes no longer than others.
 
         Args:
-            *types: Types of pixels to expect; without, uint8, uint16 and float32.
+            *types: Types of pixels to expect; without, those of uint8, uint16 and float32 that the range of
+                intensities, if one end of it is given, does not contradict.
+
+        Raises:
+            TypeError, ValueError: As :meth:`extract`, for a type that was asked for.
         """
         for kind in types or PIXEL_TYPES:
-            self.extract(np.zeros((16, 16), kind))
+            with contextlib.suppress(*() if types else (ValueError,)):
+                self.extract(np.zeros((16, 16), kind))
 
     def stages(self, image: NDArray[Any]) -> Stages:
         """Extract, and keep what every step made; arguments and errors as for :meth:`extract`."""
@@ -135,10 +145,19 @@ class LineFeatureExtractor:
             kept[step] = copy.deepcopy(result)
 
         segments = self._run(image, keep)
-        return _stages(kept, segments, self.parameters.min_length)
+        return _stages(kept, segments)
 
     def _run(self, image: NDArray[Any], watch: Callable[[str, Any], None]) -> NDArray[np.void]:
-        """The pipeline; `watch` sees the result of each step before the next one works on it."""
+        """The pipeline, for one frame at a time: two in the same memory would end the process."""
+        if not self._busy.acquire(blocking=False):
+            raise RuntimeError('the extractor is at work in another thread: each thread needs an extractor of its own')
+        try:
+            return self._steps(image, watch)
+        finally:
+            self._busy.release()
+
+    def _steps(self, image: NDArray[Any], watch: Callable[[str, Any], None]) -> NDArray[np.void]:
+        """The steps in their order; `watch` sees the result of each before the next one works on it."""
         p, buffers = self.parameters, self._buffers
         grey = grey_image(image, buffers)
         watch('input', grey)
@@ -190,14 +209,15 @@ def _check(image: Any) -> None:
     if not isinstance(image, np.ndarray):
         raise TypeError(f'image must be a numpy array, got {type(image).__name__}')
     if image.dtype.newbyteorder('=') not in PIXEL_TYPES:
-        raise TypeError(f'image must be uint8, uint16 or float32, got {image.dtype}')
+        hint = ': use image.astype(numpy.float32)' if image.dtype == np.float64 else ''
+        raise TypeError(f'image must be uint8, uint16 or float32, got {image.dtype}{hint}')
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))):
         raise ValueError(f'image must be H×W (grey), H×W×3 (BGR) or H×W×4 (BGRA), got shape {image.shape}')
     if not 0 < image.size <= 4 * MOST_PIXELS or image.shape[0] * image.shape[1] > MOST_PIXELS:
         raise ValueError(f'image must have 1 to {MOST_PIXELS} pixels, got shape {image.shape}')
 
 
-def _stages(kept: dict[str, Any], segments: NDArray[np.void], min_length: float) -> Stages:
+def _stages(kept: dict[str, Any], segments: NDArray[np.void]) -> Stages:
     """Bring what was kept of the steps from padded arrays and flat indices to pixels of the image."""
     grey, marks, lines = kept['input'], kept['edges'], kept['features']
     chains, visited = kept['scanning']
@@ -212,7 +232,7 @@ def _stages(kept: dict[str, Any], segments: NDArray[np.void], min_length: float)
         chain_offsets=chains.offsets, chain_directions=chains.directions, closed=chains.closed,
         bridged=chains.bridged, codes_before=chains.codes, codes_after=kept['normalization'],
         blobs=blobs.attributes, blob_pixels=pixels[blobs.members], blob_offsets=blobs.offsets,
-        unlinked=segments_of(lines, np.ones(lines.size, np.bool_), min_length), segments=segments)
+        unlinked=segments_of(lines, np.ones(lines.size, np.bool_), 0.0), segments=segments)
 
 
 _of_thread = threading.local()
