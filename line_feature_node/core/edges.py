@@ -142,14 +142,21 @@ def smooth_forward(image: Any, scale: float, offset: float, q: float, strip: Any
         smooth_strip(strip, width, np.float32(q))
         turn_back(strip, plane, first + PAD)
         if first == 0:
-            plane[0] = plane[PAD]
-            plane[1] = plane[PAD]
+            copy_row(plane[PAD], plane[0])
+            copy_row(plane[PAD], plane[1])
         for row in range(first + PAD, min(first + LANES, height) + PAD):
             if row == height + PAD - 1:
-                last[:] = plane[row]
+                copy_row(plane[row], last)
             recur(plane[row], plane[row - 1], plane[row - 2], np.float32(q))
     bottom = height + PAD - 1
     start_upwards(last, plane[bottom], plane[bottom - 1], plane[bottom + 1], plane[bottom + 2], np.float32(q))
+
+
+@inlined
+def copy_row(source: Any, target: Any) -> None:
+    """Copy a row; an assignment of slices would take the compiler four times as long."""
+    for i in range(target.size):
+        target[i] = source[i]
 
 
 @inlined

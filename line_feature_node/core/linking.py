@@ -255,10 +255,12 @@ def link(
 
     -1 says that there was no room for all pairs; the lines given are then as they were.
     """
-    cells[:] = -1
-    alive[:count] = True
+    for row in range(cells.shape[0]):
+        for column in range(cells.shape[1]):
+            cells[row, column] = -1
     found, waiting = 0, 0
     for k in range(count):
+        alive[k] = True
         found, waiting = find_pairs(
             k, found, waiting, lines, tau1, tau2, cell, alive, entries, cells, pairs, gaps, heap)
         if found < 0:

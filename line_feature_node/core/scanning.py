@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.edges import CODE, STRONG
-from line_feature_node.core.indices import are_neighbours
+from line_feature_node.core.indices import are_neighbours, position
 from line_feature_node.core.parameters import Parameters
 
 #: Column and row steps of the eight directions.
@@ -267,9 +267,10 @@ def link_gaps(
     that the other points to, the two point at each other, within 45 degrees, their codes are equal or neighbours, and
     nothing lies between. A chain of one pixel points nowhere and is not linked.
     """
-    links[:2 * chains] = -1
+    inverse = 1 / stride
     for end in range(2 * chains):
-        directions[end] = end_direction(pixels, offsets, end, stride)
+        links[end] = -1
+        directions[end] = end_direction(pixels, offsets, end, stride, inverse)
         if directions[end] != END:
             pixel = pixels[end_index(offsets, end)]
             ends[pixel] = end
@@ -316,7 +317,7 @@ def end_index(offsets: Any, end: int) -> int:
 
 
 @inlined
-def end_direction(pixels: Any, offsets: Any, end: int, stride: int) -> int:
+def end_direction(pixels: Any, offsets: Any, end: int, stride: int, inverse: float) -> int:
     """The chain-code direction in which a chain leaves over one of its ends; END for a chain of one pixel."""
     chain = end // 2
     reach = min(REACH, offsets[chain + 1] - offsets[chain] - 1)
@@ -324,8 +325,9 @@ def end_direction(pixels: Any, offsets: Any, end: int, stride: int) -> int:
         return END
     index = end_index(offsets, end)
     inner = pixels[index + reach if end % 2 == 0 else index - reach]
-    x = pixels[index] % stride - inner % stride
-    y = pixels[index] // stride - inner // stride
+    row, column = position(pixels[index], inverse, stride)
+    inner_row, inner_column = position(inner, inverse, stride)
+    x, y = column - inner_column, row - inner_row
     # 2 : 5 stands for tan 22.5 degrees, which no pair of steps up to REACH can tell from it.
     if 5 * abs(y) < 2 * abs(x):
         return 0 if x > 0 else 4
@@ -362,7 +364,8 @@ def assemble(
     pixels: Any, codes: Any, directions: Any, bridged: Any, offsets: Any, closed: Any,
 ) -> int:
     """Write out the linked chains with their gaps filled, without the short ones; return their number."""
-    done[:raw] = False
+    for chain in range(raw):
+        done[chain] = False
     chains = 0
     length = 0
     offsets[0] = 0
@@ -411,13 +414,15 @@ def append(
     """Copy a raw chain, beginning with the given end of it."""
     first, last = raw_offsets[end // 2], raw_offsets[end // 2 + 1]
     total = length + last - first
-    bridged[length:total] = False
-    if end % 2 == 0:
-        pixels[length:total] = raw_pixels[first:last]
-        codes[length:total] = raw_codes[first:last]
-    else:
-        pixels[length:total] = raw_pixels[first:last][::-1]
-        codes[length:total] = raw_codes[first:last][::-1]
+    for k in range(length, total):
+        bridged[k] = False
+    for k in range(last - first):
+        pixels[length + k] = raw_pixels[first + k]
+    for k in range(last - first):
+        codes[length + k] = raw_codes[first + k]
+    if end % 2 == 1:
+        reverse(pixels, length, total)
+        reverse(codes, length, total)
     return total
 
 
