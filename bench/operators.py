@@ -11,7 +11,7 @@ import numpy as np
 
 from line_feature_node.core import Parameters
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.edges import PAD, STENCILS, deriche_stencil, extract_edges
+from line_feature_node.core.edges import PAD, STENCILS, deriche_stencil, extract_edges, recur
 from line_feature_node.scenes import corridor
 
 OPERATORS: list[dict[str, Any]] = [
@@ -30,6 +30,10 @@ def gradient(image: Any, parameters: Parameters) -> Any:
     height, width = image.shape
     plane = buffers.image('smoothed' if parameters.operator == 'dog' else 'plane',
                           *buffers._arrays['plane'].shape, np.float32)[:height + 2 * PAD, :width + 2 * PAD]
+    if parameters.operator == 'deriche':
+        # What the sweep does row by row.
+        for row in range(height + PAD - 1, -1, -1):
+            recur(plane[row], plane[row + 1], plane[row + 2], np.float32(np.exp(-parameters.alpha)))
     side, centre = STENCILS.get(parameters.operator) or deriche_stencil(parameters.alpha)
     across = centre * plane[1:-1] + side * (plane[:-2] + plane[2:])
     return (across[:, 2:] - across[:, :-2])[1:-1, 1:-1]

@@ -16,6 +16,7 @@ from line_feature_node.core.edges import (
     deriche_stencil,
     extract_edges,
     gradient,
+    recur,
 )
 from line_feature_node.core.parameters import Parameters
 
@@ -59,10 +60,13 @@ def marks_of(image: npt.NDArray[Any], buffers: Buffers | None = None, **paramete
 def gradient_of(
     image: npt.NDArray[Any], operator: str = 'deriche', alpha: float = 1.0,
 ) -> tuple[Floats, Floats, Floats]:
-    """gx, gy and norm of each pixel, from the smoothed plane that the sweep leaves and with its kernels."""
+    """gx, gy and norm of each pixel, from the plane that the sweep reads and with its kernels."""
     buffers = Shelf()
     marks_of(image, buffers, operator=operator, alpha=alpha)
     plane = buffers.images['smoothed' if operator == 'dog' else 'plane']
+    if operator == 'deriche':
+        for row in range(image.shape[0] + PAD - 1, -1, -1):
+            recur(plane[row], plane[row + 1], plane[row + 2], np.float32(math.exp(-alpha)))
     stencil = deriche_stencil(alpha) if operator == 'deriche' else STENCILS[operator]
     side, centre = (np.float32(weight) for weight in stencil)
     across, along = np.zeros((2, plane.shape[1]), np.float32)

@@ -61,7 +61,7 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     # Whole strips of rows and whole tiles of columns fit in, with the padding.
     lines, columns = -(-height // LANES) * LANES, -(-(width + 2 * PAD) // TILE) * TILE
     plane = buffers.image('plane', lines + 2 * PAD, columns, np.float32)
-    rows = buffers.image('rows', 12, columns, np.float32)
+    rows = buffers.image('rows', 15, columns, np.float32)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     # An image of another width may have had the same padded one, and pixels where the padding is now.
     marks[:, MARGIN + width:] = 0
@@ -240,6 +240,14 @@ def recur(y: Any, y1: Any, y2: Any, q: Any) -> None:
         y[i] = first * y1[i] + (second * y2[i] + gain * y[i])
 
 
+@inlined
+def recur_into(x: Any, y1: Any, y2: Any, y: Any, q: Any) -> None:
+    """As :func:`recur`, into a row of its own: a row that is x and y at once looks to the compiler like a hazard."""
+    gain, first, second = (1 - q) * (1 - q), 2 * q, -q * q
+    for i in range(y.size):
+        y[i] = first * y1[i] + (second * y2[i] + gain * x[i])
+
+
 @kernel
 def start_upwards(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
     """Write the two rows below the image with which the vertical anticausal pass starts."""
@@ -254,15 +262,23 @@ def sweep(
     height: int, width: int, recursive: bool, q: float, side: float, centre: float, T1: float, T2: float, thin: bool,
     plane: Any, rows: Any, marks: Any,
 ) -> None:
-    """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it."""
+    """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it.
+
+    Only a few rows are written besides the marks; to smooth the plane in place would push the marks out of the cache,
+    which are read next.
+    """
     b, a = np.float32(side), np.float32(centre)
     across, along = rows[0], rows[1]
-    gx, gy, norm = rows[3:6], rows[6:9], rows[9:12]
+    gx, gy, norm, smooth = rows[3:6], rows[6:9], rows[9:12], rows[12:15]
+    for row in (height + PAD, height + PAD + 1):
+        copy_row(plane[row], smooth[row % 3])
     for row in range(height + PAD - 1, -1, -1):
+        below, middle, above = row % 3, (row + 2) % 3, (row + 1) % 3
         if recursive:
-            recur(plane[row], plane[row + 1], plane[row + 2], np.float32(q))
-        below, middle, above = (row + 3) % 3, (row + 2) % 3, (row + 1) % 3
-        combine_columns(plane[row], plane[row + 1], plane[row + 2], b, a, across, along)
+            recur_into(plane[row], smooth[above], smooth[middle], smooth[below], np.float32(q))
+        else:
+            copy_row(plane[row], smooth[below])
+        combine_columns(smooth[below], smooth[above], smooth[middle], b, a, across, along)
         gradient(across, along, b, a, gx[above], gy[above], norm[above])
         if row < height:
             suppress(norm[above], norm[middle], norm[below], gx[middle], gy[middle], np.float32(T1), np.float32(T2),
