@@ -138,6 +138,8 @@ def compare(
     parameters: Parameters,
     path: Annotated[Optional[Path], typer.Argument(  # noqa: UP045  as above
         metavar='IMAGE', readable=False, help='Image file; a rendered corridor without.')] = None,
+    noise: Annotated[float, typer.Option(
+        min=0.0, max=100.0, help='Noise of the rendered corridors, in grey levels.')] = 4.0,
     out: Out = Path('line_features'),
 ) -> None:
     """Compare ways of thinning edges and of fitting lines, as section 3 of the paper does: the six panels of Fig. 5.
@@ -145,7 +147,7 @@ def compare(
     Without an image, on rendered corridors, the errors of each combination are measured against the ground truth.
     """
     try:
-        image = scenes.corridor().image if path is None else decode(path.read_bytes())
+        image = scenes.corridor(noise=noise).image if path is None else decode(path.read_bytes())
         panels = section3.compare_pictures(files.displayable(image, parameters), parameters)
         target = out / f'{"corridor" if path is None else path.stem}-section3.png'
         out.mkdir(parents=True, exist_ok=True)
@@ -155,7 +157,7 @@ def compare(
     except (TypeError, ValueError) as error:
         _fail(str(error) if path is None else f'{path}: {error}')
     if path is None:
-        _console.print(_table_of_errors(section3.measure_errors(parameters)))
+        _console.print(_table_of_errors(section3.measure_errors(parameters, noise)))
     _console.print(f'panels: {target}', markup=False)
 
 
