@@ -153,7 +153,8 @@ def compare(
         out.mkdir(parents=True, exist_ok=True)
         files.write_picture(target, sheet(panels, columns=2))
     except OSError as error:
-        _fail(f'{error.filename}: {error.strerror}')
+        _fail(f'{error.filename}: {error.strerror}' if error.filename == str(path)
+              else f'cannot write to {out}: {error.strerror}')
     except (TypeError, ValueError) as error:
         _fail(str(error) if path is None else f'{path}: {error}')
     if path is None:

@@ -92,10 +92,9 @@ def process(
     of_thread = threading.local()
 
     def work(path: Path, name: str) -> Outcome:
-        new = not hasattr(of_thread, 'extractor')
-        if new:
+        if not hasattr(of_thread, 'extractor'):
             of_thread.extractor = LineFeatureExtractor(parameters)
-        return _process(path, out / name, of_thread.extractor, stages=stages, again=new)
+        return _process(path, out / name, of_thread.extractor, stages=stages)
 
     with ThreadPoolExecutor(workers or os.cpu_count()) as executor:
         yield from executor.map(work, paths, _names(paths))
@@ -115,13 +114,13 @@ def _names(paths: list[Path]) -> list[str]:
     return names
 
 
-def _process(path: Path, target: Path, extractor: LineFeatureExtractor, *, stages: bool, again: bool) -> Outcome:
-    """Extract and write; `again` for the first frame, whose time would be that of compiling and of new memory."""
+def _process(path: Path, target: Path, extractor: LineFeatureExtractor, *, stages: bool) -> Outcome:
+    """Extract and write; the first frame twice, or its time would be that of compiling and of new memory."""
     try:
         image = _read(path)
+        if not any(extractor.times.values()):
+            extractor.extract(image)
         segments = extractor.extract(image)
-        if again:
-            segments = extractor.extract(image)
     except OSError as error:
         return Outcome(path, error=error.strerror or str(error))
     except (TypeError, ValueError) as error:

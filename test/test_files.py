@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from line_feature_node.core import Parameters
+from line_feature_node.core import LineFeatureExtractor, Parameters
 from line_feature_node.files import displayable, find_images, process
 
 STEP = np.repeat(np.where(np.arange(120) < 60, 40, 200).astype(np.uint8)[None], 90, 0)
@@ -21,6 +21,23 @@ def test_outcomes_come_in_order_with_any_number_of_workers(tmp_path):
         assert one.segments.tobytes() == four.segments.tobytes()
         assert one.table.read_bytes() == four.table.read_bytes()
     assert [outcome.width for outcome in runs[0]] == [70 + k for k in range(12)]
+
+
+def test_a_broken_first_file_does_not_spoil_the_times_of_the_second(tmp_path):
+    """The first frame takes new memory, and loads the kernels: it is extracted twice, whichever file it comes from."""
+    (tmp_path / 'a.png').write_bytes(b'junk')
+    cv2.imwrite(str(tmp_path / 'b.png'), STEP)
+    calls = []
+    original = LineFeatureExtractor.extract
+
+    def counted(self, image):
+        calls.append(image.shape)
+        return original(self, image)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LineFeatureExtractor, 'extract', counted)
+        list(process([tmp_path / 'a.png', *[tmp_path / 'b.png'] * 2], tmp_path / 'out', Parameters(), workers=1))
+    assert len(calls) == 3
 
 
 def test_results_of_files_with_one_name_do_not_overwrite_each_other(tmp_path):

@@ -63,7 +63,7 @@ class Parameters:
         8.0, 'Upper threshold of the hysteresis: a stronger gradient is an edge.',
         low=0.0, high=1000.0, unit='grey levels/pixel')
     T2: float = _parameter(
-        3.0, 'Lower threshold of the hysteresis: a stronger gradient is an edge where it is connected to one.',
+        3.0, 'Lower threshold of the hysteresis, less than T1: a stronger gradient is an edge where connected to one.',
         low=0.0, high=1000.0, unit='grey levels/pixel')
     intensity_min: float = _parameter(
         math.nan, 'Pixel value that counts as grey level 0; unset: 0.', low=-1e9, high=1e9, unset=True)
