@@ -49,11 +49,12 @@ def _with_parameters(command: Callable[..., None]) -> Callable[..., None]:
         options[name] = (type(default), None, f'{spec.description} {spec.range}{unit}; default {default}.')
     added = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=typer.Option(default, f'--{name}', help=text),
-                          annotation=kind if default is not None else Optional[kind])  # noqa: UP045  Typer 0.9, of apt
+                          annotation=kind if default is not None else Optional[kind])
         for name, (kind, default, text) in options.items()]
     described = [*(signature.parameters[name] for name in kept), *added]
     run.__name__, run.__doc__ = command.__name__, command.__doc__
-    run.__signature__ = signature.replace(parameters=described)  # type: ignore[attr-defined]
+    # What Typer reads of a function, instead of what the function has.
+    vars(run)['__signature__'] = signature.replace(parameters=described)
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in described}
     return run
 
@@ -136,7 +137,7 @@ def _table_of_steps(outcomes: list[files.Outcome]) -> Table:
 @_with_parameters
 def compare(
     parameters: Parameters,
-    path: Annotated[Optional[Path], typer.Argument(  # noqa: UP045  as above
+    path: Annotated[Optional[Path], typer.Argument(
         metavar='IMAGE', readable=False, help='Image file; a rendered corridor without.')] = None,
     noise: Annotated[float, typer.Option(
         min=0.0, max=100.0, help='Noise of the rendered corridors, in grey levels.')] = 4.0,

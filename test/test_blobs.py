@@ -103,7 +103,7 @@ def test_random_images(
 def test_any_order_of_the_pixels(image: NDArray[np.uint8], random: object, margin: int) -> None:
     def order(image: NDArray[np.uint8]) -> Pixels:
         pixels = np.argwhere(image).tolist()
-        random.shuffle(pixels)  # type: ignore[attr-defined]
+        random.shuffle(pixels)
         return np.array(pixels, np.int64).reshape(-1, 2)
 
     assert listed(*extract(image, order, margin)) == reference(image)

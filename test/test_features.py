@@ -20,7 +20,7 @@ LARGE = (4000, 4000)
 
 def segments(
     blobs: list[list[Pixel]], shape: tuple[int, int] = LARGE, codes: list[int] | None = None,
-    bridged: set[Pixel] = frozenset(), margin: int = 1, **parameters: Any,  # type: ignore[assignment]
+    bridged: set[Pixel] = frozenset(), margin: int = 1, **parameters: Any,
 ) -> NDArray[np.void]:
     """The segments of line-blobs, each given as its pixels (x, y)."""
     pixels = np.array([pixel for blob in blobs for pixel in blob], np.int64).reshape(-1, 2)

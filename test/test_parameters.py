@@ -157,7 +157,7 @@ def test_of_lists_the_names_there_are() -> None:
 
 def test_by_name_only() -> None:
     with pytest.raises(TypeError):
-        Parameters('sobel')  # type: ignore[misc]
+        Parameters('sobel')
 
 
 @pytest.mark.parametrize('name', PROFILES)
@@ -185,12 +185,12 @@ def test_profile_names() -> None:
 def test_profile_of_the_wrong_type() -> None:
     for wrong in (None, 3):
         with pytest.raises((TypeError, ValueError), match='^profile must be'):
-            Parameters.profile(wrong)  # type: ignore[arg-type]
+            Parameters.profile(wrong)
 
 
 def test_frozen() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
-        Parameters().alpha = 2.0  # type: ignore[misc]
+        Parameters().alpha = 2.0
 
 
 def test_equal_and_hashable() -> None:

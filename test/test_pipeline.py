@@ -318,7 +318,7 @@ def test_extractor_survives_a_wrong_image() -> None:
     wrong[3, 3] = np.nan
     for image in (wrong, np.zeros((0, 3), np.uint8), None):
         with pytest.raises((TypeError, ValueError)):
-            extractor.extract(image)  # type: ignore[arg-type]
+            extractor.extract(image)
     assert same(extractor.extract(scene()), expected)
 
 

@@ -195,4 +195,4 @@ def test_looking_at_a_blank_ceiling_gives_no_truth() -> None:
 )
 def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        corridor(**arguments)  # type: ignore[arg-type]
+        corridor(**arguments)

@@ -54,8 +54,8 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
 
     Returns:
         Marks, uint8: the CODE of each pixel that passed the suppression (where that is the way of thinning) and
-        exceeds T2, with STRONG where it exceeds
-        T1, and 0 elsewhere; padded by MARGIN on each side, and at the right to a multiple of eight columns.
+        exceeds T2, with STRONG where it exceeds T1, and 0 elsewhere; padded by MARGIN on each side, and at the right to
+        a multiple of eight columns.
     """
     height, width = image.shape
     # Whole strips of rows and whole tiles of columns fit in, with the padding.

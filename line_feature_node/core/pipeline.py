@@ -165,7 +165,7 @@ class LineFeatureExtractor:
         if p.thinning == 'morphological':
             thin(marks)
         watch('edges', marks)
-        chains = unscanned(marks, buffers) if p.thinning == 'none' else scan_edges(marks, p, buffers)
+        chains = unscanned(marks) if p.thinning == 'none' else scan_edges(marks, p, buffers)
         watch('scanning', (chains, marks))
         normalize_codes(chains, p.n)
         watch('normalization', chains.codes)

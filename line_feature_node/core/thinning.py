@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.edges import CODE, STRONG
 from line_feature_node.core.scanning import END, TAKEN, Chains
 
@@ -34,12 +33,11 @@ def thin(marks: NDArray[np.uint8]) -> None:
     marks[:] = np.where(edges != 0, marks | STRONG, 0)
 
 
-def unscanned(marks: NDArray[np.uint8], buffers: Buffers) -> Chains:
+def unscanned(marks: NDArray[np.uint8]) -> Chains:
     """All pixels of thick edges after hysteresis; no chains are there to be scanned.
 
     Args:
         marks: As edge extraction leaves them; edge pixels become TAKEN.
-        buffers: Memory to work in.
 
     Returns:
         Pixels and codes of the edges, and no chains.
@@ -49,10 +47,8 @@ def unscanned(marks: NDArray[np.uint8], buffers: Buffers) -> Chains:
     flat = marks.reshape(-1)
     codes = flat[pixels] & np.uint8(CODE)
     flat[pixels] = TAKEN
-    offsets = buffers.array('offsets', 1, np.int32)[:1]
-    offsets[0] = 0
-    return Chains(pixels, codes, np.full(pixels.size, END, np.uint8), np.zeros(pixels.size, np.bool_), offsets,
-                  np.zeros(0, np.bool_))
+    return Chains(pixels, codes, np.full(pixels.size, END, np.uint8), np.zeros(pixels.size, np.bool_),
+                  np.zeros(1, np.int32), np.zeros(0, np.bool_))
 
 
 def connected(marks: NDArray[np.uint8]) -> NDArray[np.uint8]:
