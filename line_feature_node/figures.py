@@ -47,7 +47,7 @@ def stage_pictures(image: Picture, stages: Stages, scale: int | None = None) -> 
         'codes-after': enlarged(painted(shape, stages.chain_pixels, CODE_COLOURS[stages.codes_after]), scale),
         'blobs': enlarged(painted(shape, stages.blob_pixels, hues(blobs)), scale),
         'segments-unlinked': draw_overlay(enlarged(blank, scale), scaled(stages.unlinked, scale)),
-        'segments': draw_overlay(enlarged(blank, scale), scaled(stages.segments, scale)),
+        'segments': draw_overlay(enlarged(blank, scale), scaled(stages.linked, scale)),
     }
 
 

@@ -36,7 +36,7 @@ def segments(
         ((pixels[:, 1] + margin) * stride + pixels[:, 0] + margin).astype(np.int32), filled, stride, margin, shape,
         Parameters(**{'min_size': 2, **parameters}), Buffers())
     assert lines.size >= 2 * count
-    return segments_of(lines, np.ones(count, np.bool_), 0.0)
+    return segments_of(lines, np.ones(count, np.bool_))
 
 
 def segment(blob: list[Pixel], **options: Any) -> Any:
@@ -313,7 +313,7 @@ def test_labels_not_in_use_give_nothing() -> None:
         Blobs(attributes, np.arange(6, dtype=np.int32), np.array([0, 0, 6], np.int32)), pixels, np.zeros(6, np.bool_),
         40, 1, (20, 38), Parameters(), Buffers())
     assert count == 1
-    assert ends(segments_of(lines, np.ones(1, np.bool_), 0.0)[0]) == [10, 4, 15, 4]
+    assert ends(segments_of(lines, np.ones(1, np.bool_))[0]) == [10, 4, 15, 4]
 
 
 def test_bridged_pixels_do_not_count() -> None:
@@ -354,20 +354,3 @@ def test_layout() -> None:
         assert SEGMENT_DTYPE[name] == (np.uint32 if name in ('code', 'size') else np.float32)
     assert SEGMENT_DTYPE.itemsize == 4 * len(SEGMENT_DTYPE.names)
     assert segments([line((1, 0))]).dtype == SEGMENT_DTYPE
-
-
-@pytest.mark.parametrize(('min_length', 'count'), [(0, 3), (2.5, 2), (7, 2), (7.001, 1), (21, 1), (21.001, 0)])
-def test_min_length(min_length: float, count: int) -> None:
-    """Shorter segments are dropped, those of just that length are not."""
-    attributes = np.zeros(3, BLOB_DTYPE)
-    pixels = []
-    for k, length in enumerate((2, 7, 21)):
-        attributes[k] = (3, length + 1, 3 * k, 3 * k, 0, length, True)
-        pixels += [(3 * k + 1) * 40 + x + 1 for x in range(length + 1)]
-    offsets = np.array([0, 3, 11, 33], np.int32)
-    lines, found = compute_lines(
-        Blobs(attributes, np.arange(33, dtype=np.int32), offsets), np.array(pixels, np.int32), np.zeros(33, np.bool_),
-        40, 1, (20, 38), Parameters(min_size=2), Buffers())
-    assert found == 3
-    assert segments_of(lines, np.ones(3, np.bool_), min_length).size == count
-    assert segments_of(lines, np.array([True, False, False]), min_length).size == (min_length <= 2)

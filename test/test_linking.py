@@ -461,7 +461,7 @@ def test_order_of_the_lines_does_not_matter(tau1: float, tau2: float, seed: int)
     for _ in range(4):
         order = rng.permutation(len(pieces))
         left = link([pieces[k] for k in order], [codes[k] for k in order], tau1=tau1, tau2=tau2)
-        segments = segments_of(left, np.ones(left.size, np.bool_), 0.0)
+        segments = segments_of(left, np.ones(left.size, np.bool_))
         results.append((comparable(left), sorted(segment.tobytes() for segment in segments)))
     assert all(result == results[0] for result in results)
 

@@ -18,7 +18,8 @@ TYPES = [np.uint8, np.uint16, np.float32]
 #: Column and row steps of the chain code: 0 is +x, then in steps of 45 degrees towards +y.
 STEPS_OF_CODE = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
 FRAMES = ['grey', 'candidates', 'strong', 'edges', 'chain_pixels', 'chain_offsets', 'chain_directions', 'closed',
-          'bridged', 'codes_before', 'codes_after', 'blobs', 'blob_pixels', 'blob_offsets', 'unlinked', 'segments']
+          'bridged', 'codes_before', 'codes_after', 'blobs', 'blob_pixels', 'blob_offsets', 'unlinked', 'linked',
+          'segments']
 
 
 def half_plane(height: int, width: int, degrees: float, x: float, y: float) -> npt.NDArray[np.float64]:
@@ -502,9 +503,30 @@ def test_unlinked_counts_segments_before_linking() -> None:
 def test_linking_only_joins() -> None:
     """No edge pixel is lost or counted twice by it."""
     for seed in range(4):
-        stages = LineFeatureExtractor(Parameters(min_length=0)).stages(scene(seed=seed))
-        assert stages.unlinked['size'].sum() == stages.segments['size'].sum()
-        assert len(stages.segments) <= len(stages.unlinked)
+        stages = LineFeatureExtractor(Parameters(max_segments=2)).stages(scene(seed=seed))
+        assert stages.unlinked['size'].sum() == stages.linked['size'].sum()
+        assert len(stages.linked) <= len(stages.unlinked)
+        assert len(stages.segments) < len(stages.linked)
+
+
+def test_linked_are_all_segments_whatever_is_selected() -> None:
+    """In the order of the result, which leaves some out."""
+    plain = LineFeatureExtractor(Parameters(min_length=0)).stages(scene(seed=1))
+    assert same(plain.linked, plain.segments)
+    for chosen in ({'min_length': 20}, {'max_segments': 3}, {'theta_min': 0, 'theta_max': 1}, {'min_length': 1e5}):
+        stages = LineFeatureExtractor(Parameters(**chosen)).stages(scene(seed=1))
+        assert same(stages.linked, plain.linked)
+        chosen_bytes = {segment.tobytes() for segment in stages.segments}
+        left = [k for k, segment in enumerate(plain.linked) if segment.tobytes() in chosen_bytes]
+        assert len(left) < len(plain.linked)
+        assert same(stages.segments, plain.linked[left])
+
+
+def test_linked_and_segments_are_arrays_of_their_own() -> None:
+    stages = LineFeatureExtractor(Parameters(min_length=0)).stages(scene())
+    linked = stages.linked.copy()
+    stages.segments['x'] = -1
+    assert same(stages.linked, linked)
 
 
 # Truths that hold for every image.
@@ -606,14 +628,13 @@ def check_moments(stages: Stages, parameters: Parameters) -> None:
             else:
                 theta = math.atan2(xy, xx) if xx >= yy else math.atan2(yy, xy)
             expected.append((n, *points.mean(0), theta, stages.blobs['dir'][k]))
-    if parameters.min_length == 0:
-        assert len(expected) == len(stages.unlinked)
-        for segment, (n, x, y, theta, code) in zip(stages.unlinked, expected, strict=True):
-            assert (segment['size'], segment['code']) == (n, code)
-            assert segment['x'] == pytest.approx(x, abs=1e-3)
-            assert segment['y'] == pytest.approx(y, abs=1e-3)
-            turned = (segment['theta'] - theta + math.pi / 2) % math.pi - math.pi / 2
-            assert abs(turned) < 1e-5
+    assert len(expected) == len(stages.unlinked)
+    for segment, (n, x, y, theta, code) in zip(stages.unlinked, expected, strict=True):
+        assert (segment['size'], segment['code']) == (n, code)
+        assert segment['x'] == pytest.approx(x, abs=1e-3)
+        assert segment['y'] == pytest.approx(y, abs=1e-3)
+        turned = (segment['theta'] - theta + math.pi / 2) % math.pi - math.pi / 2
+        assert abs(turned) < 1e-5
 
 
 def check_segments(segments: npt.NDArray[np.void], height: int, width: int, parameters: Parameters) -> None:
@@ -655,7 +676,9 @@ def check_everything(image: Image, parameters: Parameters) -> Stages:
     check_blobs(stages)
     check_moments(stages, parameters)
     check_segments(stages.unlinked, height, width, dataclasses.replace(parameters, min_length=0))
+    check_segments(stages.linked, height, width, dataclasses.replace(parameters, min_length=0))
     check_segments(stages.segments, height, width, parameters)
+    assert same(stages.segments, stages.linked[stages.linked['length'] >= np.float32(parameters.min_length)])
     return stages
 
 

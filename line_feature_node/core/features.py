@@ -197,26 +197,26 @@ def end_points(segments: NDArray[np.void]) -> NDArray[np.float64]:
     return np.stack([segments[name] for name in ('x1', 'y1', 'x2', 'y2')], -1).astype(float)
 
 
-def segments_of(lines: NDArray[np.void], alive: NDArray[np.bool_], min_length: float) -> NDArray[np.void]:
-    """The lines that are left as a new SEGMENT_DTYPE array, without those shorter than min_length."""
+def segments_of(lines: NDArray[np.void], alive: NDArray[np.bool_]) -> NDArray[np.void]:
+    """The lines that are left as a new SEGMENT_DTYPE array."""
     segments = np.empty(np.count_nonzero(alive), SEGMENT_DTYPE)
-    return segments[:write_segments(lines[:alive.size], alive, min_length, segments)]
+    write_segments(lines[:alive.size], alive, segments)
+    return segments
 
 
 @kernel
-def write_segments(lines: Any, alive: Any, min_length: float, segments: Any) -> int:
-    """Fill in the records that users get; return how many."""
+def write_segments(lines: Any, alive: Any, segments: Any) -> None:
+    """Fill in the records that users get."""
     count = 0
     for k in range(lines.size):
-        line = lines[k]
-        length = np.hypot(line['x2'] - line['x1'], line['y2'] - line['y1'])
-        if not alive[k] or length < min_length:
+        if not alive[k]:
             continue
+        line = lines[k]
         segment = segments[count]
         segment['x'], segment['y'], segment['z'] = line['x'], line['y'], 0
         segment['x1'], segment['y1'] = line['x1'], line['y1']
         segment['x2'], segment['y2'] = line['x2'], line['y2']
-        segment['length'] = length
+        segment['length'] = np.hypot(line['x2'] - line['x1'], line['y2'] - line['y1'])
         cos, sin = line['cos'], line['sin']
         theta = np.float32(np.arctan2(sin, cos))
         # A line just short of vertical may round to -pi/2, which is not in the range.
@@ -226,4 +226,3 @@ def write_segments(lines: Any, alive: Any, min_length: float, segments: Any) -> 
         segment['code'] = line['code']
         segment['size'] = line['n']
         count += 1
-    return count

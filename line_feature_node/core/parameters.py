@@ -1,11 +1,21 @@
 """The one table of parameters: name, default, range, unit and description of each."""
 
+import array
 import dataclasses
 import math
 import numbers
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+
+from line_feature_node.core.profiles import PROFILES
+
+Self = TypeVar('Self', bound='ParameterSet')  # typing has it from Python 3.11 only
+
+#: Just beyond a right angle, so that what is rounded to four digits is in range.
+RIGHT_ANGLE = 1.5708
 
 
 @dataclass(frozen=True)
@@ -13,12 +23,13 @@ class Spec:
     """What is known of one parameter besides its default.
 
     Attributes:
+        description: One sentence for people.
         low: Smallest value allowed, of a number.
         high: Largest value allowed, of a number.
         unit: Unit of measure, '' for a pure number or a choice.
-        description: One sentence for people.
         choices: The values allowed, of a choice.
         unset: Whether NaN is allowed, and means "not given".
+        constant: Whether a running node keeps the value that it was started with.
     """
 
     description: str
@@ -27,21 +38,64 @@ class Spec:
     unit: str = ''
     choices: tuple[str, ...] = ()
     unset: bool = False
+    constant: bool = False
 
     @property
     def range(self) -> str:
-        """The allowed values, in words: '0.1 to 5' or 'deriche, sobel'."""
+        """The allowed values, in words: '0.1 to 5' or 'deriche, sobel'; '' where every one is."""
         if self.choices:
             return ', '.join(self.choices)
+        if self.low == -math.inf:
+            return ''
         return f'{self.low:g} to {self.high:g}' + (', or nan for unset' if self.unset else '')
 
 
-def _parameter(default: Any, description: str, **spec: Any) -> Any:
+def parameter(default: Any, description: str, **spec: Any) -> Any:
+    """A field of a :class:`ParameterSet`, its type that of the default; `spec` is the rest of its :class:`Spec`."""
     return dataclasses.field(default=default, metadata={'spec': Spec(description, **spec)})
 
 
+class ParameterSet:
+    """What tables of parameters have in common: values are checked when made, compared and listed.
+
+    Subclasses are frozen dataclasses whose fields are made by :func:`parameter`.
+    """
+
+    def __post_init__(self) -> None:
+        for field in _fields(self):
+            object.__setattr__(self, field.name, _checked(field, getattr(self, field.name)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[Any, ...]:
+        """All values; None for unset ones, since NaN is not equal to itself."""
+        return tuple(None if value != value else value for value in vars(self).values())
+
+    @classmethod
+    def of(cls: type[Self], values: Mapping[str, Any]) -> Self:
+        """Parameters from a mapping; an unknown name is a TypeError that says which names there are."""
+        names = list(cls.specs())
+        for name in values:
+            if name not in names:
+                raise TypeError(f'unknown parameter {name!r}: the parameters are {", ".join(names)}')
+        return cls(**values)
+
+    @classmethod
+    def specs(cls) -> dict[str, Spec]:
+        """Name of every parameter, in order, with its range, unit and description."""
+        return {field.name: field.metadata['spec'] for field in _fields(cls)}
+
+
+def _fields(table: Any) -> 'tuple[dataclasses.Field[Any], ...]':
+    return dataclasses.fields(table)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Parameters:
+class Parameters(ParameterSet):
     """Every parameter of the pipeline, checked when made and never changed after.
 
     The names alpha, T1, T2, n, tau1 and tau2 are the paper's. :meth:`specs` gives range, unit and description of each.
@@ -51,63 +105,69 @@ class Parameters:
         ValueError: A value is outside its range, or the values contradict each other.
     """
 
-    operator: str = _parameter(
+    operator: str = parameter(
         'deriche', 'Edge operator; dog is the derivative of a Gaussian.',
         choices=('deriche', 'sobel', 'prewitt', 'scharr', 'dog'))
-    alpha: float = _parameter(
+    alpha: float = parameter(
         1.0, "Width of Deriche's operator: smaller smooths more.", low=0.2, high=5.0, unit='1/pixel')
-    sigma: float = _parameter(
+    sigma: float = parameter(
         1.0, 'Standard deviation of the Gaussian, for the operator dog: larger smooths more.',
         low=0.3, high=10.0, unit='pixels')
-    T1: float = _parameter(
+    T1: float = parameter(
         8.0, 'Upper threshold of the hysteresis: a stronger gradient is an edge.',
         low=0.0, high=1000.0, unit='grey levels/pixel')
-    T2: float = _parameter(
+    T2: float = parameter(
         3.0, 'Lower threshold of the hysteresis, less than T1: a stronger gradient is an edge where connected to one.',
         low=0.0, high=1000.0, unit='grey levels/pixel')
-    intensity_min: float = _parameter(
+    intensity_min: float = parameter(
         math.nan, 'Pixel value that counts as grey level 0; unset: 0.', low=-1e9, high=1e9, unset=True)
-    intensity_max: float = _parameter(
+    intensity_max: float = parameter(
         math.nan, 'Pixel value that counts as grey level 255; unset: the largest of the integer type, 255 for floats.',
         low=-1e9, high=1e9, unset=True)
-    thinning: str = _parameter(
+    thinning: str = parameter(
         'suppression', 'How edges are thinned: by suppressing what is no maximum of the gradient, by morphology after '
         'the hysteresis, or not at all (then there are no chains).', choices=('suppression', 'morphological', 'none'))
-    max_gap: int = _parameter(2, 'Longest gap in a broken edge that is bridged.', low=0, high=8, unit='pixels')
-    min_chain: int = _parameter(8, 'Shorter edge chains are dropped.', low=1, high=100000, unit='pixels')
-    n: int = _parameter(
+    max_gap: int = parameter(2, 'Longest gap in a broken edge that is bridged.', low=0, high=8, unit='pixels')
+    min_chain: int = parameter(8, 'Shorter edge chains are dropped.', low=1, high=100000, unit='pixels')
+    n: int = parameter(
         4, 'Window of the edge normalisation, before and after; 0 turns it off.', low=0, high=10000, unit='pixels')
-    min_size: int = _parameter(5, 'Smaller line-blobs give no segment.', low=2, high=100000, unit='pixels')
-    orientation: str = _parameter(
+    min_size: int = parameter(5, 'Smaller line-blobs give no segment.', low=2, high=100000, unit='pixels')
+    orientation: str = parameter(
         'principal_axis', 'How the orientation of a line-blob is computed.',
         choices=('principal_axis', 'least_squares'))
-    tau1: float = _parameter(
+    tau1: float = parameter(
         1.0, 'Linked segments have their mid-points nearer than this to the line of the other.',
         low=0.0, high=20.0, unit='pixels')
-    tau2: float = _parameter(
+    tau2: float = parameter(
         6.0, 'Linked segments have two end points nearer than this to each other.',
         low=0.0, high=100.0, unit='pixels')
-    min_length: float = _parameter(
+    min_length: float = parameter(
         0.0, 'Shorter segments are dropped after linking.', low=0.0, high=100000.0, unit='pixels')
+    max_segments: int = parameter(
+        0, 'At most this many segments, the longest, are kept; 0 keeps all.', low=0, high=1000000)
+    theta_min: float = parameter(
+        -RIGHT_ANGLE, 'Segments are kept from this orientation, growing, to theta_max: with theta_min above theta_max, '
+        'through the vertical.', low=-RIGHT_ANGLE, high=RIGHT_ANGLE, unit='radians')
+    theta_max: float = parameter(
+        RIGHT_ANGLE, 'Last orientation of the band that is kept.', low=-RIGHT_ANGLE, high=RIGHT_ANGLE, unit='radians')
+    roi: tuple[float, float, float, float] = parameter(
+        (0.0, 0.0, 1.0, 1.0), 'Region of interest: x, y, width and height, in shares of the picture where none of them '
+        'exceeds 1, else in whole pixels.', low=0.0, high=1e6)
+    scale: float = parameter(
+        1.0, 'The picture is made smaller by this factor first; segments come in pixels of the full size, while '
+        'parameters in pixels, but for min_length and roi, are in those of the smaller picture.', low=0.05, high=1.0)
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, _checked(field, getattr(self, field.name)))
+        super().__post_init__()
         if self.T2 >= self.T1:
             raise ValueError(f'T2 must be less than T1, got T2 = {self.T2:g} and T1 = {self.T1:g}')
         if self.intensity_min >= self.intensity_max:
             raise ValueError('intensity_min must be less than intensity_max, got '
                              f'{self.intensity_min:g} and {self.intensity_max:g}')
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Parameters) and self._key() == other._key()
-
-    def __hash__(self) -> int:
-        return hash(self._key())
-
-    def _key(self) -> tuple[Any, ...]:
-        """All values; None for unset ones, since NaN is not equal to itself."""
-        return tuple(None if value != value else value for value in vars(self).values())
+        if min(self.roi[2:]) <= 0:
+            raise ValueError(f'roi must have a width and a height above 0, got {list(self.roi)}')
+        if max(self.roi) > 1 and not all(value.is_integer() for value in self.roi):
+            raise ValueError(f'roi must be shares of 0 to 1 or whole pixels, got {list(self.roi)}')
 
     @classmethod
     def paper(cls) -> 'Parameters':
@@ -128,45 +188,48 @@ class Parameters:
         """
         if not isinstance(name, str) or name not in PROFILES:
             raise ValueError(f'profile must be one of {", ".join(PROFILES)}, got {name!r}')
-        return cls.of({**PROFILES[name], **parameters})
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> 'Parameters':
-        """Parameters from a mapping; an unknown name is a TypeError that says which names there are."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        for name in values:
-            if name not in names:
-                raise TypeError(f'unknown parameter {name!r}: the parameters are {", ".join(names)}')
-        return cls(**values)
-
-    @classmethod
-    def specs(cls) -> dict[str, Spec]:
-        """Name of every parameter, in order, with its range, unit and description."""
-        return {field.name: field.metadata['spec'] for field in dataclasses.fields(cls)}
-
-
-#: The named sets: what each changes of the defaults.
-PROFILES: dict[str, dict[str, Any]] = {
-    'default': {},
-    'paper': {},
-}
+        return cls.of({**PROFILES[name].values, **parameters})
 
 
 def _checked(field: 'dataclasses.Field[Any]', value: Any) -> Any:
     """The value as the type of its field, or the error that says what is wrong with it."""
     spec: Spec = field.metadata['spec']
-    expected = f'{field.name} must be'
-    if spec.choices:
-        if not isinstance(value, str):
-            raise TypeError(f'{expected} one of {spec.range}, got {value!r}')
-        if value not in spec.choices:
-            raise ValueError(f'{expected} one of {spec.range}, got {value!r}')
-        return value
-    whole = isinstance(field.default, int)
+    if isinstance(field.default, tuple):
+        return _checked_list(field.name, spec, value, len(field.default))
+    if isinstance(field.default, str):
+        return _checked_text(field.name, spec, value)
+    if isinstance(field.default, bool):
+        if not isinstance(value, bool | np.bool_):
+            raise TypeError(f'{field.name} must be true or false, got {value!r}')
+        return bool(value)
+    return _checked_number(field.name, spec, value, whole=isinstance(field.default, int))
+
+
+def _checked_text(name: str, spec: Spec, value: Any) -> str:
+    expected = f'{name} must be {"one of " + spec.range if spec.choices else "a text"}, got {value!r}'
+    if not isinstance(value, str):
+        raise TypeError(expected)
+    if spec.choices and value not in spec.choices:
+        raise ValueError(expected)
+    return value
+
+
+def _checked_list(name: str, spec: Spec, value: Any, size: int) -> tuple[float, ...]:
+    if isinstance(value, np.ndarray | array.array):
+        value = value.tolist()
+    if isinstance(value, str | bytes | bytearray | memoryview) or not isinstance(value, Sequence):
+        raise TypeError(f'{name} must be a list of {size} numbers, got {value!r}')
+    if len(value) != size:
+        raise ValueError(f'{name} must be a list of {size} numbers, got {len(value)}: {list(value)}')
+    return tuple(_checked_number(f'each number of {name}', spec, number, whole=False) for number in value)
+
+
+def _checked_number(name: str, spec: Spec, value: Any, *, whole: bool) -> float:
+    unit = spec.unit and f' {spec.unit}'
     if not isinstance(value, numbers.Integral if whole else numbers.Real) or isinstance(value, bool):
-        raise TypeError(f'{expected} {"a whole number" if whole else "a number"} of {spec.range}'
-                        f'{spec.unit and " " + spec.unit}, got {value!r}')
+        raise TypeError(f'{name} must be {"a whole number" if whole else "a number"} of {spec.range}{unit}, '
+                        f'got {value!r}')
     number: Any = value
     if not (spec.low <= number <= spec.high or (spec.unset and math.isnan(number))):
-        raise ValueError(f'{expected} {spec.range}{spec.unit and " " + spec.unit}, got {value!r}')
+        raise ValueError(f'{name} must be {spec.range}{unit}, got {value!r}')
     return int(number) if whole else float(number)

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import dataclasses
 import threading
 import time
 from collections.abc import Callable
@@ -19,7 +20,8 @@ from line_feature_node.core.features import compute_lines, segments_of
 from line_feature_node.core.linking import link_lines
 from line_feature_node.core.normalization import normalize_codes
 from line_feature_node.core.parameters import Parameters
-from line_feature_node.core.scanning import TAKEN, scan_edges
+from line_feature_node.core.scanning import BRIDGED, TAKEN, scan_edges
+from line_feature_node.core.selection import check_mask, enlarged, filled, placed, region, selected, smaller
 from line_feature_node.core.thinning import thin, unscanned
 
 #: What a frame goes through, as `times` names it: `input` is the check and the conversion to grey.
@@ -27,6 +29,9 @@ STEPS = ('input', 'edges', 'scanning', 'normalization', 'blobs', 'features', 'li
 
 #: Types of pixels that an image may have.
 PIXEL_TYPES = (np.uint8, np.uint16, np.float32)
+
+#: Told the result of each step.
+Watch = Callable[[str, Any], None]
 
 #: Pixels an image may have: positions are 32-bit numbers.
 MOST_PIXELS = 2**30
@@ -36,11 +41,13 @@ MOST_PIXELS = 2**30
 class Stages:
     """What each step made of one image, for figures, for teaching and to find out why a line is missing.
 
+    All but `segments` is in pixels of the working picture: the region of interest, made smaller by `scale`.
+
     Pixels are N×2 int32, column and row; codes are uint8, 1 to 4. All chains stand one after the other, chain k from
     ``chain_offsets[k]`` to ``chain_offsets[k + 1]``; blobs in the same way.
 
     Attributes:
-        grey: H×W, the image as the first step saw it, before its intensity is mapped.
+        grey: H×W, the working picture as the first step saw it, before its intensity is mapped.
         candidates: H×W uint8, codes of the pixels that pass the thinning and exceed T2, 0 elsewhere.
         strong: H×W bool, those of them that exceed T1.
         edges: H×W uint8, the quintuple image after hysteresis: codes of all edge pixels, 0 elsewhere.
@@ -55,8 +62,9 @@ class Stages:
             merged into them and are empty.
         blob_pixels: Pixels of the line-blobs.
         blob_offsets: int32, where each blob starts.
-        unlinked: SEGMENT_DTYPE, segments before linking; `min_length` applies after it.
-        segments: SEGMENT_DTYPE, the result.
+        unlinked: SEGMENT_DTYPE, segments before linking.
+        linked: SEGMENT_DTYPE, all segments after linking.
+        segments: SEGMENT_DTYPE, the result: those of them that are selected, in pixels of the full picture.
     """
 
     grey: NDArray[Any]
@@ -74,7 +82,33 @@ class Stages:
     blob_pixels: NDArray[np.int32]
     blob_offsets: NDArray[np.int32]
     unlinked: NDArray[np.void]
+    linked: NDArray[np.void]
     segments: NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class View:
+    """Where the working picture lies in the full one.
+
+    Attributes:
+        shape: Rows and columns of the full picture.
+        x, y: Column and row of its first pixel in the full picture.
+        width, height: Columns and rows of the full picture that it covers.
+        across, down: Columns and rows of the full picture for each of its own.
+    """
+
+    shape: tuple[int, int] = (0, 0)
+    x: int = 0
+    y: int = 0
+    width: int = 0
+    height: int = 0
+    across: float = 1.0
+    down: float = 1.0
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is the full picture."""
+        return (self.x, self.y, self.across, self.down) == (0, 0, 1, 1)
 
 
 class LineFeatureExtractor:
@@ -84,7 +118,7 @@ class LineFeatureExtractor:
     without the GIL.
 
     Attributes:
-        parameters: What it was made with.
+        parameters: What the next frame is extracted with; may be replaced between two frames.
         times: Seconds that each of STEPS took in the last frame that was extracted.
         unlinked: How many segments the last frame had before linking.
     """
@@ -97,19 +131,23 @@ class LineFeatureExtractor:
         self.unlinked = 0
         self._buffers = Buffers()
         self._busy = threading.Lock()
+        self._view = View()
+        self._marks: NDArray[np.uint8] = np.zeros((2 * MARGIN, 2 * MARGIN), np.uint8)
 
-    def extract(self, image: NDArray[Any]) -> NDArray[np.void]:
+    def extract(self, image: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[np.void]:
         """Extract the line segments of an image.
 
         Args:
             image: H×W (grey), H×W×1, H×W×3 (BGR) or H×W×4 (BGRA), of any strides; uint8, uint16 or float32.
+            mask: H×W, bool or uint8: no edge is found where it is 0, nor beside masked pixels that are NaN or infinite.
 
         Returns:
             SEGMENT_DTYPE, one record a segment, a new array each time.
 
         Raises:
-            TypeError: The image is no array or has another type of pixel.
-            ValueError: The image has another shape, no pixels, or pixels that are NaN or infinite; or intensity_min or
+            TypeError: The image or the mask is no array or has another type of pixel.
+            ValueError: The image or the mask has another shape; the image has no pixels, none that is finite, or some
+                that are neither finite nor masked; nothing of it is in the region of interest; or intensity_min or
                 intensity_max, of which only one is given, contradicts the type of the pixels.
             RuntimeError: Another thread uses the extractor at this moment.
         """
@@ -121,7 +159,24 @@ class LineFeatureExtractor:
             self.times[step] = now - last
             last = now
 
-        return self._run(image, lap)
+        return self._run(image, mask, lap)
+
+    def edges(self) -> NDArray[np.uint8]:
+        """The edges of the last frame after hysteresis, in the size of the full picture.
+
+        Returns:
+            H×W uint8: 255 on an edge, 0 elsewhere and outside the region of interest.
+        """
+        view, marks = self._view, self._marks
+        height, width = (round(size / factor) for size, factor in (
+            (view.height, view.down), (view.width, view.across)))
+        inner = marks[MARGIN:MARGIN + height, MARGIN:MARGIN + width]
+        edges = np.where(inner & (TAKEN | BRIDGED) == TAKEN, np.uint8(255), np.uint8(0))
+        if view.whole and edges.shape == view.shape:
+            return edges
+        full = np.zeros(view.shape, np.uint8)
+        full[view.y:view.y + view.height, view.x:view.x + view.width] = enlarged(edges, view.height, view.width)
+        return full
 
     def warm_up(self, *types: Any) -> None:
         """Compile the kernels, or load them from the cache, so that the first frame takes no longer than others.
@@ -135,33 +190,38 @@ class LineFeatureExtractor:
         """
         for kind in types or PIXEL_TYPES:
             with contextlib.suppress(*() if types else (ValueError,)):
-                self.extract(np.zeros((16, 16), kind))
+                copy_of_it = LineFeatureExtractor(dataclasses.replace(self.parameters, roi=(0, 0, 1, 1), scale=1))
+                copy_of_it.extract(np.zeros((16, 16), kind))
 
-    def stages(self, image: NDArray[Any]) -> Stages:
+    def stages(self, image: NDArray[Any], mask: NDArray[Any] | None = None) -> Stages:
         """Extract, and keep what every step made; arguments and errors as for :meth:`extract`."""
         kept: dict[str, Any] = {}
 
         def keep(step: str, result: Any) -> None:
             kept[step] = copy.deepcopy(result)
 
-        segments = self._run(image, keep)
+        segments = self._run(image, mask, keep)
         return _stages(kept, segments)
 
-    def _run(self, image: NDArray[Any], watch: Callable[[str, Any], None]) -> NDArray[np.void]:
+    def _run(self, image: NDArray[Any], mask: NDArray[Any] | None, watch: Watch) -> NDArray[np.void]:
         """The pipeline, for one frame at a time: two in the same memory would end the process."""
         if not self._busy.acquire(blocking=False):
             raise RuntimeError('the extractor is at work in another thread: each thread needs an extractor of its own')
         try:
-            return self._steps(image, watch)
+            return self._steps(image, mask, watch)
         finally:
             self._busy.release()
 
-    def _steps(self, image: NDArray[Any], watch: Callable[[str, Any], None]) -> NDArray[np.void]:
+    def _steps(self, image: NDArray[Any], mask: NDArray[Any] | None, watch: Watch) -> NDArray[np.void]:
         """The steps in their order; `watch` sees the result of each before the next one works on it."""
         p, buffers = self.parameters, self._buffers
-        grey = grey_image(image, buffers)
+        grey, keep, view = working_picture(image, mask, p, buffers)
         watch('input', grey)
         marks = extract_edges(grey, p, buffers)
+        self._view, self._marks = view, marks
+        if keep is not None:
+            inner = marks[MARGIN:MARGIN + grey.shape[0], MARGIN:MARGIN + grey.shape[1]]
+            np.bitwise_and(inner, keep, out=inner)
         if p.thinning == 'morphological':
             thin(marks)
         watch('edges', marks)
@@ -176,18 +236,45 @@ class LineFeatureExtractor:
         watch('features', lines[:count])
         self.unlinked = count
         alive = link_lines(lines, count, grey.shape, p, buffers)
-        segments = segments_of(lines, alive, p.min_length)
+        segments = segments_of(lines, alive)
         watch('linking', segments)
-        return segments
+        if not view.whole:
+            segments = placed(segments, view.x, view.y, view.across, view.down)
+        return selected(segments, p)
+
+
+def working_picture(
+    image: NDArray[Any], mask: NDArray[Any] | None, parameters: Parameters, buffers: Buffers,
+) -> tuple[NDArray[Any], NDArray[np.uint8] | None, View]:
+    """What the first step is to see of an image; arguments and errors as for :meth:`LineFeatureExtractor.extract`.
+
+    Returns:
+        Grey, H×W, C-contiguous, read-only: the image itself where it is that already; the mask, 255 where pixels count,
+        None where all do; and where the working picture lies in the image.
+    """
+    _check(image)
+    shape = image.shape[:2]
+    x, y, width, height = region(parameters.roi, shape[1], shape[0])
+    part = slice(y, y + height), slice(x, x + width)
+    keep = None
+    if mask is not None:
+        check_mask(mask, shape)
+        keep = np.where(mask[part], np.uint8(255), np.uint8(0))
+    grey = grey_image(image[part], buffers)
+    if grey.dtype == np.float32 and not cv2.checkRange(grey)[0]:
+        if keep is None:
+            raise ValueError('image must be finite, got pixels that are NaN or infinite')
+        grey, keep = filled(grey, keep)
+    if parameters.scale < 1:
+        grey, keep = smaller(grey, keep, parameters.scale)
+    # Numba tells read-only arrays from others and would compile the kernels for both.
+    grey = grey.view()
+    grey.flags.writeable = False
+    return grey, keep, View(shape, x, y, width, height, width / grey.shape[1], height / grey.shape[0])
 
 
 def grey_image(image: NDArray[Any], buffers: Buffers) -> NDArray[Any]:
-    """Check an image and make it grey; arguments and errors as for :meth:`LineFeatureExtractor.extract`.
-
-    Returns:
-        H×W, C-contiguous, read-only: the image itself where it is that already.
-    """
-    _check(image)
+    """An image that was checked in grey, H×W and C-contiguous: the image itself where it is that already."""
     if not (image.flags.c_contiguous and image.dtype.isnative):
         image = np.ascontiguousarray(image, image.dtype.newbyteorder('='))
     height, width = image.shape[:2]
@@ -196,11 +283,6 @@ def grey_image(image: NDArray[Any], buffers: Buffers) -> NDArray[Any]:
         cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY, dst=grey)
     else:
         grey = image.reshape(height, width)
-    if grey.dtype == np.float32 and not cv2.checkRange(grey)[0]:
-        raise ValueError('image must be finite, got pixels that are NaN or infinite')
-    # Numba tells read-only arrays from others and would compile the kernels for both.
-    grey = grey.view()
-    grey.flags.writeable = False
     return grey
 
 
@@ -232,17 +314,18 @@ def _stages(kept: dict[str, Any], segments: NDArray[np.void]) -> Stages:
         chain_offsets=chains.offsets, chain_directions=chains.directions, closed=chains.closed,
         bridged=chains.bridged, codes_before=chains.codes, codes_after=kept['normalization'],
         blobs=blobs.attributes, blob_pixels=pixels[blobs.members], blob_offsets=blobs.offsets,
-        unlinked=segments_of(lines, np.ones(lines.size, np.bool_), 0.0), segments=segments)
+        unlinked=segments_of(lines, np.ones(lines.size, np.bool_)), linked=kept['linking'], segments=segments)
 
 
 _of_thread = threading.local()
 
 
-def extract(image: NDArray[Any], **parameters: Any) -> NDArray[np.void]:
+def extract(image: NDArray[Any], mask: NDArray[Any] | None = None, **parameters: Any) -> NDArray[np.void]:
     """Extract the line segments of an image; may be called from any thread.
 
     Args:
         image: H×W (grey), H×W×3 (BGR) or H×W×4 (BGRA), of any strides; uint8, uint16 or float32.
+        mask: H×W, bool or uint8: no edge is found where it is 0, nor beside masked pixels that are NaN or infinite.
         **parameters: Those of :class:`Parameters`; what is not given has its default. `profile` names a set.
 
     Returns:
@@ -256,4 +339,4 @@ def extract(image: NDArray[Any], **parameters: Any) -> NDArray[np.void]:
     extractor: LineFeatureExtractor | None = getattr(_of_thread, 'extractor', None)
     if extractor is None or extractor.parameters != chosen:
         extractor = _of_thread.extractor = LineFeatureExtractor(chosen)
-    return extractor.extract(image)
+    return extractor.extract(image, mask)

@@ -27,6 +27,8 @@ STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 #: A mark of a pixel that belongs to a chain already, or fills a gap.
 TAKEN = 16
+#: With TAKEN: the pixel fills a gap.
+BRIDGED = 64
 #: With TAKEN: a chain that may be linked ends here.
 ENDING = 32
 #: The bits of a candidate that no chain has yet.
@@ -354,7 +356,7 @@ def take_gap(marks: Any, pixel: int, target: int, gap: int, stride: int) -> bool
         if marks[gap_pixel(pixel, target, k, gap, stride)] != 0:
             return False
     for k in range(1, gap + 1):
-        marks[gap_pixel(pixel, target, k, gap, stride)] = TAKEN
+        marks[gap_pixel(pixel, target, k, gap, stride)] = TAKEN | BRIDGED
     return True
 
 
