@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, Parameters
-from line_feature_node.core.edges import intensity_map
 from line_feature_node.figures import sheet, stage_pictures
-from line_feature_node.images import decode
+from line_feature_node.images import decode, displayable, range_hint
 from line_feature_node.overlay import draw_overlay
 
 #: Files that are taken for images by their name, so that broken ones are reported.
@@ -24,8 +23,6 @@ SUFFIXES = {'.avif', '.bmp', '.exr', '.gif', '.hdr', '.jp2', '.jpeg', '.jpg', '.
             '.tif', '.tiff', '.webp'}
 #: How the name of an overlay ends.
 OVERLAY = '-overlay.png'
-#: Grey levels between the darkest and the brightest pixel of a picture that uses hardly any of its range.
-FAINT = 16.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +125,8 @@ def _process(path: Path, target: Path, extractor: LineFeatureExtractor, *, stage
     outcome = Outcome(
         path, width=image.shape[1], height=image.shape[0], segments=segments, unlinked=extractor.unlinked,
         times=dict(extractor.times), overlay=target.with_name(target.name + OVERLAY),
-        table=target.with_name(f'{target.name}-segments.csv'), hint=_hint(image, segments, extractor.parameters))
+        table=target.with_name(f'{target.name}-segments.csv'),
+        hint='' if len(segments) else range_hint(image, extractor.parameters))
     try:
         _write(outcome, image, extractor)
         if stages:
@@ -147,16 +145,6 @@ def _read(path: Path) -> NDArray[Any]:
     return decode(path.read_bytes())
 
 
-def _hint(image: NDArray[Any], segments: NDArray[np.void], parameters: Parameters) -> str:
-    """What may be wrong where nothing was found in a picture that uses hardly any of its range of intensities."""
-    scale, _ = intensity_map(image.dtype, parameters)
-    spread = float(image.max()) - float(image.min())
-    if len(segments) or spread == 0 or scale * spread > FAINT:
-        return ''
-    return (f'pixels from {image.min():g} to {image.max():g} are {scale * spread / 255:.1%} of the range: '
-            f'intensity_min and intensity_max say what is black and white')
-
-
 def _write(outcome: Outcome, image: NDArray[Any], extractor: LineFeatureExtractor) -> None:
     assert outcome.overlay is not None
     assert outcome.table is not None
@@ -167,18 +155,26 @@ def _write(outcome: Outcome, image: NDArray[Any], extractor: LineFeatureExtracto
 
 
 def _write_stages(image: NDArray[Any], target: Path, extractor: LineFeatureExtractor) -> None:
-    pictures = stage_pictures(displayable(image, extractor.parameters), extractor.stages(image))
+    stages = extractor.stages(image)
+    pictures = stage_pictures(displayable(stages.grey, extractor.parameters), stages)
     for number, (name, picture) in enumerate(pictures.items()):
         write_picture(target.with_name(f'{target.name}-{number}-{name}.png'), picture)
     write_picture(target.with_name(f'{target.name}-stages.png'), sheet(pictures, columns=4))
 
 
-def displayable(image: NDArray[Any], parameters: Parameters) -> NDArray[np.uint8]:
-    """The image with its range of intensities brought to bytes."""
-    scale, offset = intensity_map(image.dtype, parameters)
-    if image.dtype == np.uint8 and (scale, offset) == (1, 0):
-        return image
-    return np.clip(scale * image + offset, 0, 255).astype(np.uint8)
+def read_mask(path: Path) -> NDArray[np.uint8]:
+    """A mask for images, H×W: 0 where the picture in a file is black.
+
+    Raises:
+        ValueError: It cannot be read, or is no picture.
+    """
+    try:
+        mask = decode(path.read_bytes(), grey=True)
+    except OSError as error:
+        raise ValueError(f'mask_file {path}: {error.strerror}') from None
+    except ValueError as error:
+        raise ValueError(f'mask_file {path}: {error}') from None
+    return np.where(mask != 0, np.uint8(255), np.uint8(0))
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
