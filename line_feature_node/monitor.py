@@ -1,0 +1,166 @@
+"""What the node knows of its own health: counters, times, and the verdict on them."""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from line_feature_node.core import STEPS
+from line_feature_node.options import Options
+
+#: How many of the latest frames the percentiles are of.
+WINDOW = 300
+#: A jump of the sequence number by more is a publisher that began anew, not a loss.
+LARGEST_JUMP = 10000
+
+
+class Level(IntEnum):
+    """Of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Health:
+    """The state of the node in a form for people and plots.
+
+    Attributes:
+        level: How it is.
+        summary: One sentence.
+        values: Figures by name, those that are numbers with point and without unit.
+    """
+
+    level: Level
+    summary: str
+    values: dict[str, str]
+
+
+@dataclass
+class Counts:
+    """Frames since the start."""
+
+    received: int = 0
+    processed: int = 0
+    dropped: int = 0
+    failed: int = 0
+
+
+@dataclass
+class Monitor:
+    """Counts frames and measures times; told of each frame by the node.
+
+    Attributes:
+        counts: Frames since the start.
+        reasons: How often frames failed for a reason, without its figures.
+        last_error: The latest reason, '' without.
+    """
+
+    counts: Counts = field(default_factory=Counts)
+    reasons: Counter[str] = field(default_factory=Counter)
+    last_error: str = ''
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        self._sequence: int | None = None
+        self._latencies: deque[float] = deque(maxlen=WINDOW)
+        self._steps: deque[tuple[float, ...]] = deque(maxlen=WINDOW)
+        self._segments = 0
+        self._reported = Counts()
+        self._reported_at = self._last_image = self.clock()
+
+    def restart(self) -> None:
+        """Images are waited for from now on, by a new subscription: its sequence numbers begin anywhere."""
+        self._sequence = None
+        self._last_image = self.clock()
+
+    def receive(self, sequence: int | None) -> None:
+        """Count a frame and, by its publisher's sequence number, those before it that never came.
+
+        Args:
+            sequence: Publication sequence number; None where it says nothing, as with several publishers.
+        """
+        self.counts.received += 1
+        self._last_image = self.clock()
+        if sequence is not None and self._sequence is not None:
+            missed = sequence - self._sequence - 1
+            if 0 < missed < LARGEST_JUMP:
+                self.counts.dropped += missed
+        self._sequence = sequence
+
+    def process(self, latency: float, times: Mapping[str, float], segments: int) -> None:
+        """Count a frame that gave segments.
+
+        Args:
+            latency: Seconds from the publication of the image to that of the segments.
+            times: Seconds of each step.
+            segments: How many there are.
+        """
+        self.counts.processed += 1
+        self._latencies.append(latency)
+        self._steps.append(tuple(times[step] for step in STEPS))
+        self._segments = segments
+
+    def fail(self, reason: str) -> None:
+        """Count a frame that gave none."""
+        self.counts.failed += 1
+        self.last_error = reason
+        self.reasons[reason.split(':', 1)[0][:80]] += 1
+        if len(self.reasons) > WINDOW:  # of figures in them, from bytes that are noise
+            self.reasons = Counter(dict(self.reasons.most_common(WINDOW // 2)))
+
+    def health(self, options: Options, *, publishers: int | None, waiting: str) -> Health:
+        """The verdict on the time since it was last asked for.
+
+        Args:
+            options: Its thresholds are used.
+            publishers: How many publishers the image topic has; None while it is not subscribed to.
+            waiting: What the node waits for while it is not subscribed.
+        """
+        now, latest = self.clock(), self.counts
+        elapsed = max(now - self._reported_at, 1e-9)
+        since = Counts(**{name: count - getattr(self._reported, name) for name, count in vars(latest).items()})
+        self._reported, self._reported_at = Counts(**vars(latest)), now
+        level, summary = self._verdict(since, options, publishers, waiting, now - self._last_image)
+        return Health(level, summary, self._values(since.processed / elapsed))
+
+    def _verdict(
+        self, since: Counts, options: Options, publishers: int | None, waiting: str, silence: float,
+    ) -> tuple[Level, str]:
+        if publishers is None:
+            return Level.OK, waiting
+        if silence > options.image_timeout:
+            if publishers == 0:
+                return Level.ERROR, f'no image for {silence:.0f} s: the topic has no publisher'
+            return Level.ERROR, f'no image for {silence:.0f} s, though there is a publisher: see the log for its QoS'
+        if since.failed and not since.processed:
+            return Level.ERROR, f'no image can be processed: {self.last_error}'
+        if since.failed:
+            return Level.WARN, f'{since.failed} of {since.received} images failed: {self.last_error}'
+        coming = since.received + since.dropped
+        if coming and since.dropped / coming > options.max_dropped:
+            return Level.WARN, f'{since.dropped} of {coming} images were dropped'
+        late = self._percentile(95)
+        if late > options.max_latency:
+            return Level.WARN, f'5 % of the segments come {late * 1e3:.0f} ms or later after their images'
+        return Level.OK, f'{self._segments} segments in the last image'
+
+    def _percentile(self, percent: float) -> float:
+        return float(np.percentile(self._latencies, percent)) if self._latencies else 0.0
+
+    def _values(self, rate: float) -> dict[str, str]:
+        times = np.median(self._steps, axis=0) * 1e3 if self._steps else np.zeros(len(STEPS))
+        return {
+            **{f'frames {name}': str(count) for name, count in vars(self.counts).items()},
+            'rate (Hz)': f'{rate:.1f}',
+            **{f'latency p{percent} (ms)': f'{self._percentile(percent) * 1e3:.2f}' for percent in (50, 95, 99)},
+            **{f'{step} (ms)': f'{time:.3f}' for step, time in zip(STEPS, times.tolist(), strict=True)},
+            'extraction (ms)': f'{times.sum():.3f}',
+            'segments': str(self._segments),
+            'last error': self.last_error,
+            **{f'failed: {reason}': str(count) for reason, count in self.reasons.most_common(5)},
+        }

@@ -1,0 +1,446 @@
+"""The ROS 2 node: an image topic in, segments, markers, an overlay and edges out."""
+
+import array
+import importlib
+import signal
+import sys
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.srv import ChangeState
+from numpy.typing import NDArray
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions, install_signal_handlers
+from rclpy.utilities import remove_ros_args
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from visualization_msgs.msg import ImageMarker
+
+from line_feature_node.core import LineFeatureExtractor
+from line_feature_node.files import read_mask
+from line_feature_node.images import compressed_image_of, displayable, image_of, known_pixels, range_hint
+from line_feature_node.messages import Messages
+from line_feature_node.monitor import Monitor
+from line_feature_node.node_parameters import QOS_OVERRIDES, NodeParameters
+from line_feature_node.overlay import draw_overlay
+
+RCLError, UnknownROSArgsError = rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError
+
+#: Signals that end the node.
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: What the node publishes, by topic.
+OUTPUTS = {
+    '~/segments': PointCloud2, '~/markers': ImageMarker, '~/overlay': Image, '~/overlay/compressed': CompressedImage,
+    '~/edges': Image,
+}
+#: Policies that a user may override for each topic.
+POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+#: Seconds between two messages of one kind in the log.
+THROTTLE = 5.0
+#: How many outputs wait for a subscriber that is slow.
+OUTPUT_DEPTH = 5
+#: Frames after which a 16-bit stream is looked at again, whether it uses its range.
+HINT_EVERY = 100
+
+
+@cache
+def _type(name: str) -> Any:
+    package, _, message = name.split('/')
+    return getattr(importlib.import_module(f'{package}.msg'), message)
+
+
+def _octets(data: NDArray[Any]) -> 'array.array[int]':
+    """Bytes as a message wants them: assigning anything else but an array takes a hundred times as long."""
+    octets = array.array('B')
+    if data.size:
+        octets.frombytes(data.reshape(-1).view(np.uint8).data)
+    return octets
+
+
+MESSAGES = Messages(_type, _octets)
+
+
+class ConfigurationError(ValueError):
+    """The node cannot start with these parameters; the message is a sentence for users."""
+
+
+class LineFeatureNode(LifecycleNode):
+    """Extracts line segments from the images of a topic.
+
+    All work is done in the callbacks of one executor, which is to be single-threaded. With `autostart` the node is
+    active when the constructor returns; its kernels are compiled by then.
+    """
+
+    def __init__(self, node_name: str = 'line_feature_node', **options: Any) -> None:
+        """Make the node and, with `autostart`, activate it.
+
+        Args:
+            node_name: Its name, unless it is remapped.
+            **options: As for rclpy.node.Node: context, namespace, cli_args, parameter_overrides, use_global_arguments
+                and others.
+
+        Raises:
+            ConfigurationError: A parameter has the wrong type or range or contradicts another, or the mask cannot be
+                read.
+        """
+        super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
+        self._publishers_of: dict[str, Publisher] = {}
+        self._subscription: Any = None
+        self._active = False
+        self._problem = ''
+        self._mask: NDArray[np.uint8] | None = None
+        self._monitor = Monitor()
+        try:
+            self._settings = NodeParameters(self, self._qos_names(), self._on_parameters)
+        except (TypeError, ValueError) as error:
+            self.destroy_node()
+            raise ConfigurationError(str(error)) from None
+        self._extractor = LineFeatureExtractor(self._settings.parameters)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', OUTPUT_DEPTH)
+        # Health is told while a simulation stands still, too.
+        self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._survive_invalid_transitions()
+        if self._settings.options.autostart:
+            self._start()
+
+    def _start(self) -> None:
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != TransitionCallbackReturn.SUCCESS:
+                self.destroy_node()
+                raise ConfigurationError(self._problem)
+
+    def _survive_invalid_transitions(self) -> None:
+        """Refuse what a client asks for in the wrong state; rclpy would raise, which ends the spinning."""
+        for service in self.services:
+            if service.srv_type is ChangeState:
+                service.callback = self._refusing(service.callback)
+
+    def _refusing(self, change_state: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return change_state(request, response)
+            except RCLError:
+                asked = request.transition.label or request.transition.id
+                self.get_logger().warning(f'transition {asked!r} was asked for, which is not possible in this state')
+                response.success = False
+                return response
+
+        return answer
+
+    # Life cycle
+
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the mask, compile the kernels and make the publishers."""
+        return self._attempt(self._configure, 'configured')
+
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to process images."""
+        return self._attempt(self._activate, 'activated')
+
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop processing images; parameters and publishers stay."""
+        self._deactivate()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Give back what configuring made."""
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop for good; what is left is to end the process."""
+        self._deactivate()
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin anew after an error in a transition."""
+        return self.on_shutdown(_state)
+
+    def _attempt(self, work: Callable[[], None], done: str) -> TransitionCallbackReturn:
+        """Do the work of a transition; what goes wrong is a sentence in the log, and the transition fails."""
+        try:
+            work()
+        except (OSError, RuntimeError, TypeError, ValueError) as error:
+            self._problem = str(error)
+            self.get_logger().error(f'cannot be {done}: {error}')
+            self._clean_up()
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _configure(self) -> None:
+        options = self._settings.options
+        self._mask = read_mask(Path(options.mask_file)) if options.mask_file else None
+        begin = time.monotonic()
+        self._extractor.warm_up()
+        self.get_logger().info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
+        for topic, kind in OUTPUTS.items():
+            self._publishers_of[topic] = self.create_publisher(
+                kind, topic, QoSProfile(depth=OUTPUT_DEPTH), qos_overriding_options=QoSOverridingOptions(POLICIES),
+                event_callbacks=PublisherEventCallbacks(
+                    matched=lambda _: self._update_subscription(),
+                    incompatible_qos=self._on_incompatible_output(topic)))
+
+    def _activate(self) -> None:
+        self._active = True
+        self._update_subscription()
+        if self._subscription is None:
+            self.get_logger().info(f'ready; waits for a subscriber of {self.resolve_topic_name("~/segments")} or its '
+                                   f'other outputs before it subscribes to {self._image_topic()} (lazy)')
+
+    def _deactivate(self) -> None:
+        self._active = False
+        self._update_subscription()
+
+    def _clean_up(self) -> None:
+        self._active = False
+        self._update_subscription()
+        for publisher in self._publishers_of.values():
+            self.destroy_publisher(publisher)
+        self._publishers_of.clear()
+        self._mask = None
+
+    # Parameters
+
+    def _on_parameters(self) -> None:
+        """Take up new parameters. The executor is single-threaded, so this is between two frames."""
+        if self._extractor.parameters != self._settings.parameters:
+            self._extractor.parameters = self._settings.parameters
+            if self._active:
+                self._extractor.warm_up()
+        self._update_subscription()
+
+    # Topics
+
+    def _image_topic(self) -> str:
+        topic = self.resolve_topic_name('image')
+        return f'{topic}/compressed' if self._settings.options.image_transport == 'compressed' else str(topic)
+
+    def _qos_names(self) -> list[str]:
+        """Names of the parameters that override quality of service."""
+        image = self.resolve_topic_name('image')
+        topics = [(self.resolve_topic_name(topic), 'publisher') for topic in OUTPUTS]
+        topics += [(image, 'subscription'), (f'{image}/compressed', 'subscription')]
+        return [f'{QOS_OVERRIDES}{topic}.{end}.{policy.name.lower()}' for topic, end in topics for policy in POLICIES]
+
+    def _update_subscription(self) -> None:
+        """Subscribe to images when they are wanted, and only then."""
+        wanted = self._active and (not self._settings.options.lazy or self._has_listeners())
+        if wanted and self._subscription is None:
+            self._subscribe()
+        elif not wanted and self._subscription is not None:
+            self.destroy_subscription(self._subscription)
+            self._subscription = None
+            if self._active:
+                self.get_logger().info('nobody listens any more: unsubscribed from the images')
+
+    def _has_listeners(self) -> bool:
+        return any(publisher.get_subscription_count() for publisher in self._publishers_of.values())
+
+    def _subscribe(self) -> None:
+        topic = self._image_topic()
+        compressed = self._settings.options.image_transport == 'compressed'
+        # REP 2003: best effort for sensor data. Of frames that come faster than they are processed the newest counts.
+        qos = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+        callback: Any = self._on_compressed_image if compressed else self._on_raw_image
+        self._subscription = self.create_subscription(
+            CompressedImage if compressed else Image, topic, callback, qos,
+            qos_overriding_options=QoSOverridingOptions(POLICIES),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_input(topic)))
+        self._monitor.restart()
+        chosen = self._subscription.qos_profile
+        self.get_logger().info(f'ready; waits for images on {topic} ({chosen.reliability.name.lower()}, '
+                               f'depth {chosen.depth})')
+
+    def _on_incompatible_input(self, topic: str) -> Callable[[Any], None]:
+        def warn(event: Any) -> None:
+            policy = _policy(event)
+            self.get_logger().warning(
+                f'no image comes from a publisher of {topic}, as it offers another {policy} than this node asks for: '
+                f'start the node with -p {QOS_OVERRIDES}{topic}.subscription.{policy}:={_WEAKER.get(policy, "...")}')
+
+        return warn
+
+    def _on_incompatible_output(self, topic: str) -> Callable[[Any], None]:
+        def warn(event: Any) -> None:
+            policy, resolved = _policy(event), self.resolve_topic_name(topic)
+            self.get_logger().warning(
+                f'a subscriber of {resolved} gets nothing, as it asks for another {policy} than this node offers: '
+                f'start the node with -p {QOS_OVERRIDES}{resolved}.publisher.{policy}:={_STRONGER.get(policy, "...")}')
+
+        return warn
+
+    # Frames
+
+    def _on_raw_image(self, message: Image, info: dict[str, Any]) -> None:
+        self._on_frame(message, info, image_of, lambda: f'{message.encoding}')
+
+    def _on_compressed_image(self, message: CompressedImage, info: dict[str, Any]) -> None:
+        self._on_frame(message, info, compressed_image_of, lambda: f'{message.format!r}')
+
+    def _on_frame(
+        self, message: Any, info: dict[str, Any], decode: Callable[[Any], NDArray[Any]], form: Callable[[], str],
+    ) -> None:
+        """Process one frame. Whatever is wrong with it costs a line in the log, and the next one is processed."""
+        begin = time.time_ns()
+        subscription = self._subscription
+        alone = subscription is not None and subscription.get_publisher_count() == 1
+        self._monitor.receive(info.get('publication_sequence_number') if alone else None)
+        try:
+            image = decode(message)
+            segments = self._extractor.extract(image, self._mask_for(image))
+        except (cv2.error, MemoryError, TypeError, ValueError) as error:
+            self._on_bad_frame(message, error)
+            return
+        self._publish('~/segments', lambda: MESSAGES.segments(segments, message.header))
+        times = self._extractor.times
+        # Where the middleware does not know when the image was published, it is taken from when it came.
+        sent = info.get('source_timestamp') or begin
+        self._monitor.process((time.time_ns() - sent) * 1e-9, times, len(segments))
+        if self._monitor.counts.processed == 1:
+            height, width = image.shape
+            self.get_logger().info(f'first image: {width}×{height} {form()}, {len(segments)} segments')
+        self._publish_pictures(image, segments, message.header, (time.time_ns() - begin) * 1e-6)
+        if image.dtype == np.uint16 and self._monitor.counts.processed % HINT_EVERY == 1:
+            self._hint(image)
+
+    def _mask_for(self, image: NDArray[Any]) -> NDArray[Any] | None:
+        known, mask = known_pixels(image), self._mask
+        if known is None or mask is None or known.shape != mask.shape:
+            return known if mask is None else mask
+        return known & (mask != 0)
+
+    def _on_bad_frame(self, message: Any, error: Exception) -> None:
+        stamp = message.header.stamp
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        self._monitor.fail(reason)
+        self.get_logger().warning(
+            f'image on {self._image_topic()} with stamp {stamp.sec}.{stamp.nanosec:09d} is left out: {reason}',
+            throttle_duration_sec=THROTTLE)
+
+    def _hint(self, image: NDArray[Any]) -> None:
+        hint = range_hint(image, self._extractor.parameters)
+        if hint:
+            self.get_logger().info(f'image on {self._image_topic()}: {hint}', once=True)
+
+    def _publish(self, topic: str, make: Callable[[], Any]) -> None:
+        """Publish what is made, if anybody listens: publish() serialises even when nobody does."""
+        publisher = self._publishers_of[topic]
+        if publisher.get_subscription_count():
+            publisher.publish(make())
+
+    def _publish_pictures(
+        self, image: NDArray[Any], segments: NDArray[np.void], header: Any, milliseconds: float,
+    ) -> None:
+        @cache
+        def overlay() -> NDArray[np.uint8]:
+            picture = displayable(image, self._extractor.parameters)
+            return draw_overlay(picture, segments, f'{len(segments)} segments, {milliseconds:.1f} ms')
+
+        def compressed() -> NDArray[np.uint8]:
+            quality = [cv2.IMWRITE_JPEG_QUALITY, self._settings.options.jpeg_quality]
+            return np.asarray(cv2.imencode('.jpg', overlay(), quality)[1], np.uint8)
+
+        self._publish('~/markers', lambda: MESSAGES.markers(segments, header))
+        self._publish('~/overlay', lambda: MESSAGES.image(overlay(), header))
+        self._publish('~/overlay/compressed', lambda: MESSAGES.compressed_image(compressed(), header))
+        self._publish('~/edges', lambda: MESSAGES.image(self._extractor.edges(), header))
+
+    # Diagnostics
+
+    def _publish_diagnostics(self) -> None:
+        publishers = None if self._subscription is None else self._subscription.get_publisher_count()
+        waiting = 'waits for a subscriber (lazy)' if self._active else 'not active'
+        health = self._monitor.health(self._settings.options, publishers=publishers, waiting=waiting)
+        status = DiagnosticStatus(
+            level=bytes([health.level]), name=f'{self.get_fully_qualified_name()}: line features',
+            message=health.summary, hardware_id=self._image_topic(),
+            values=[KeyValue(key=key, value=value) for key, value in health.values.items()])
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+
+#: Values that are compatible with what any publisher offers, and with what any subscriber asks for.
+_WEAKER = {'reliability': 'best_effort', 'durability': 'volatile'}
+_STRONGER = {'reliability': 'reliable', 'durability': 'transient_local'}
+
+
+def _policy(event: Any) -> str:
+    return str(qos_policy_name_from_kind(event.last_policy_kind)).lower()
+
+
+def spin(node: LineFeatureNode) -> None:
+    """Let a node work until its context is shut down."""
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        while node.context.ok():
+            _spin_while_all_is_well(node, executor)
+    finally:
+        executor.shutdown()
+
+
+def _spin_while_all_is_well(node: LineFeatureNode, executor: SingleThreadedExecutor) -> None:
+    """Spin until the context is shut down, or a callback raises something.
+
+    That is logged, and the node goes on: a client that sends nonsense to one of rclpy's services does not end it.
+    """
+    try:
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        node.context.try_shutdown()
+    except Exception as error:  # noqa: BLE001
+        if node.context.ok():
+            node.get_logger().error(f'a callback failed: {error!r}', throttle_duration_sec=THROTTLE)
+
+
+def run(args: list[str], stop: object = False) -> int:
+    """Run the node as a process until SIGINT or SIGTERM; return its exit status, 2 where it cannot start.
+
+    Args:
+        args: Those of the command line, with its name.
+        stop: Becomes true when such a signal came before the node was ready for it.
+    """
+    try:
+        node = _started(args)
+    except (ConfigurationError, RCLError) as error:
+        print(f'line_feature_node cannot start: {" ".join(str(error).split())}', file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
+    # From here on rclpy shuts its context down, which ends the spinning; Python's own handlers do nothing.
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: None)
+    install_signal_handlers(SignalHandlerOptions.ALL)
+    try:
+        if not stop:
+            spin(node)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _started(args: list[str]) -> LineFeatureNode:
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except UnknownROSArgsError as error:
+        raise ConfigurationError(f'unknown arguments behind --ros-args: {error}') from None
+    unknown = remove_ros_args(args)[1:]
+    if unknown:
+        raise ConfigurationError(f'unknown argument {unknown[0]!r}: parameters stand behind --ros-args')
+    return LineFeatureNode()

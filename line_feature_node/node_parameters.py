@@ -1,0 +1,147 @@
+"""The tables of parameters as parameters of a ROS 2 node: declared, checked together, and swapped as one."""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from line_feature_node.core import Parameters
+from line_feature_node.core.parameters import Spec
+from line_feature_node.options import Options
+
+#: Parameters that rclpy itself declares.
+BUILT_IN = {'use_sim_time', 'start_type_description_service'}
+#: How the names of rclpy's parameters for quality of service begin.
+QOS_OVERRIDES = 'qos_overrides.'
+
+
+class NodeParameters:
+    """The parameters of a node, in two frozen objects that are replaced as one.
+
+    The node must have been made with automatically_declare_parameters_from_overrides, so that overrides can be read:
+    here they are checked, whole numbers are taken for doubles, and what no parameter claims is warned of.
+
+    Attributes:
+        parameters: Those of the extraction.
+        options: The node's own.
+    """
+
+    def __init__(self, node: Node, qos_overrides: Iterable[str], changed: Callable[[], None]) -> None:
+        """Declare everything.
+
+        Args:
+            node: Where.
+            qos_overrides: Names of the parameters for quality of service that the node will declare.
+            changed: Called after each change.
+
+        Raises:
+            TypeError, ValueError: An override has the wrong type or range, or contradicts another; the message has the
+                name of the parameter.
+        """
+        self._changed = changed
+        overrides = _taken_overrides(node)
+        self.options = Options.of(_known(overrides, Options))
+        self.parameters = Parameters.profile(self.options.profile, **_known(overrides, Parameters))
+        _warn_of_unknown(node, overrides, {*_NAMES, *qos_overrides})
+        for table in (self.options, self.parameters):
+            for name, spec in table.specs().items():
+                node.declare_parameter(name, _ros_value(getattr(table, name)), _descriptor(name, spec),
+                                       ignore_override=True)
+        # Registered last, as declaring calls them too. A callback that raises would end the spinning.
+        node.add_pre_set_parameters_callback(self._complete)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def _complete(self, changes: list[Parameter]) -> list[Parameter]:
+        """Numbers as the type they are wanted in, and with a profile all values that it sets."""
+        completed = [change if change.name not in _NAMES or change.type_ == Parameter.Type.NOT_SET
+                     else _parameter(change.name, _converted(change.name, change.value)) for change in changes]
+        given = {change.name for change in changes}
+        for change in completed:
+            if change.name == 'profile' and change.value in Options.specs()['profile'].choices:
+                chosen = Parameters.profile(change.value)
+                completed += [_parameter(name, getattr(chosen, name)) for name in chosen.specs() if name not in given]
+        return completed
+
+    def _candidate(self, changes: list[Parameter]) -> tuple[Parameters, Options]:
+        values = {change.name: change.value for change in changes}
+        return (dataclasses.replace(self.parameters, **_known(values, Parameters)),
+                dataclasses.replace(self.options, **_known(values, Options)))
+
+    def _check(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            self._candidate(changes)
+        except (TypeError, ValueError) as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, changes: list[Parameter]) -> None:
+        if any(change.name in _NAMES for change in changes):
+            self.parameters, self.options = self._candidate(changes)
+            self._changed()
+
+
+_NAMES = {**Parameters.specs(), **Options.specs()}
+_DEFAULTS = {name: getattr(table, name) for table in (Parameters(), Options()) for name in table.specs()}
+
+
+def _taken_overrides(node: Node) -> dict[str, Any]:
+    """Values of all overrides, by name, as their tables want them; taken from the node, which then lacks them."""
+    values = {}
+    for name in set(node.get_parameters_by_prefix('')) - BUILT_IN:
+        values[name] = _converted(name, node.get_parameter(name).value)
+        node.undeclare_parameter(name)
+    return values
+
+
+def _known(values: dict[str, Any], table: type[Parameters] | type[Options]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name in table.specs()}
+
+
+def _warn_of_unknown(node: Node, overrides: Iterable[str], names: set[str]) -> None:
+    for name in overrides:
+        if name not in names:
+            similar = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+            hint = f': did you mean {similar[0]!r}?' if similar else ''
+            node.get_logger().warning(f'there is no parameter {name!r}, what it is set to has no effect{hint}')
+
+
+def _converted(name: str, value: Any) -> Any:
+    """A number as the type of its parameter, where nothing is lost by it: users write 50 for 50.0, and tools 4.0 for 4.
+
+    What cannot be converted is left to the check.
+    """
+    default = _DEFAULTS.get(name)
+    if isinstance(default, float) and type(value) is int:
+        return float(value)
+    if type(default) is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if isinstance(default, tuple) and not isinstance(value, str) and hasattr(value, '__len__'):
+        return [float(item) if type(item) is int else item for item in value]
+    return value
+
+
+def _ros_value(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _parameter(name: str, value: Any) -> Parameter:
+    return Parameter(name, value=_ros_value(value))
+
+
+def _descriptor(name: str, spec: Spec) -> ParameterDescriptor:
+    """What tools show of a parameter. NaN, which stands for "unset", would be outside of any range."""
+    constraints = ', '.join(filter(None, (spec.range, spec.unit)))
+    descriptor = ParameterDescriptor(
+        name=name, description=spec.description, additional_constraints=constraints, read_only=spec.constant)
+    default = _DEFAULTS[name]
+    if type(default) is int:
+        descriptor.integer_range = [IntegerRange(from_value=int(spec.low), to_value=int(spec.high), step=1)]
+    elif isinstance(default, float) and not spec.unset and math.isfinite(spec.high):
+        descriptor.floating_point_range = [FloatingPointRange(from_value=spec.low, to_value=spec.high, step=0.0)]
+    return descriptor
