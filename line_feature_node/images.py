@@ -219,7 +219,7 @@ def range_hint(image: NDArray[Any], parameters: Parameters) -> str:
     if not finite.size:
         return ''
     low, high = float(finite.min()), float(finite.max())
-    few_bits = (image.dtype == np.uint16 and math.isnan(parameters.intensity_max)
+    few_bits = (image.dtype.newbyteorder('=') == np.uint16 and math.isnan(parameters.intensity_max)
                 and high < FEW_BITS * np.iinfo(np.uint16).max)
     if low == high or not (few_bits or scale * (high - low) <= FAINT):
         return ''

@@ -35,7 +35,7 @@ from line_feature_node.files import read_mask
 from line_feature_node.images import compressed_image_of, displayable, image_of, known_pixels, range_hint
 from line_feature_node.messages import Messages
 from line_feature_node.monitor import Monitor
-from line_feature_node.node_parameters import QOS_OVERRIDES, NodeParameters
+from line_feature_node.node_parameters import QOS_OVERRIDES, QOS_POLICIES, NodeParameters
 from line_feature_node.overlay import draw_overlay
 
 RCLError, UnknownROSArgsError = rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError
@@ -48,7 +48,7 @@ OUTPUTS = {
     '~/edges': Image,
 }
 #: Policies that a user may override for each topic.
-POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+POLICIES = [QoSPolicyKind[name.upper()] for name in QOS_POLICIES]
 #: Seconds between two messages of one kind in the log.
 THROTTLE = 5.0
 #: How many outputs wait for a subscriber that is slow.
@@ -116,6 +116,11 @@ class LineFeatureNode(LifecycleNode):
         self._survive_invalid_transitions()
         if self._settings.options.autostart:
             self._start()
+
+    def destroy_node(self) -> None:
+        """Destroy the node with its state machine, which would keep it in the graph until the garbage is collected."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
 
     def _start(self) -> None:
         for trigger in (self.trigger_configure, self.trigger_activate):
@@ -235,7 +240,7 @@ class LineFeatureNode(LifecycleNode):
         image = self.resolve_topic_name('image')
         topics = [(self.resolve_topic_name(topic), 'publisher') for topic in OUTPUTS]
         topics += [(image, 'subscription'), (f'{image}/compressed', 'subscription')]
-        return [f'{QOS_OVERRIDES}{topic}.{end}.{policy.name.lower()}' for topic, end in topics for policy in POLICIES]
+        return [f'{QOS_OVERRIDES}{topic}.{end}.{policy}' for topic, end in topics for policy in QOS_POLICIES]
 
     def _update_subscription(self) -> None:
         """Subscribe to images when they are wanted, and only then."""
@@ -315,7 +320,7 @@ class LineFeatureNode(LifecycleNode):
             height, width = image.shape
             self.get_logger().info(f'first image: {width}×{height} {form()}, {len(segments)} segments')
         self._publish_pictures(image, segments, message.header, (time.time_ns() - begin) * 1e-6)
-        if image.dtype == np.uint16 and self._monitor.counts.processed % HINT_EVERY == 1:
+        if image.dtype.kind == 'u' and image.itemsize == 2 and self._monitor.counts.processed % HINT_EVERY == 1:
             self._hint(image)
 
     def _mask_for(self, image: NDArray[Any]) -> NDArray[Any] | None:
@@ -363,7 +368,8 @@ class LineFeatureNode(LifecycleNode):
     # Diagnostics
 
     def _publish_diagnostics(self) -> None:
-        publishers = None if self._subscription is None else self._subscription.get_publisher_count()
+        # Those that do not fit, too: the subscription counts only those that it gets images from.
+        publishers = None if self._subscription is None else self.count_publishers(self._image_topic())
         waiting = 'waits for a subscriber (lazy)' if self._active else 'not active'
         health = self._monitor.health(self._settings.options, publishers=publishers, waiting=waiting)
         status = DiagnosticStatus(
@@ -386,6 +392,8 @@ def _policy(event: Any) -> str:
 
 def spin(node: LineFeatureNode) -> None:
     """Let a node work until its context is shut down."""
+    if not node.context.ok():
+        return
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     try:

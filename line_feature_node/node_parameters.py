@@ -18,6 +18,13 @@ from line_feature_node.options import Options
 BUILT_IN = {'use_sim_time', 'start_type_description_service'}
 #: How the names of rclpy's parameters for quality of service begin.
 QOS_OVERRIDES = 'qos_overrides.'
+#: The policies that may be overridden, with their values; depth is a number.
+QOS_POLICIES: dict[str, tuple[str, ...]] = {
+    'history': ('keep_last', 'keep_all', 'system_default'),
+    'depth': (),
+    'reliability': ('best_effort', 'reliable', 'system_default', 'best_available'),
+    'durability': ('volatile', 'transient_local', 'system_default', 'best_available'),
+}
 
 
 class NodeParameters:
@@ -47,7 +54,10 @@ class NodeParameters:
         overrides = _taken_overrides(node)
         self.options = Options.of(_known(overrides, Options))
         self.parameters = Parameters.profile(self.options.profile, **_known(overrides, Parameters))
-        _warn_of_unknown(node, overrides, {*_NAMES, *qos_overrides})
+        names = {*_NAMES, *qos_overrides}
+        for name in names & overrides.keys() - _NAMES.keys():
+            _check_qos(name, overrides[name])
+        _warn_of_unknown(node, overrides, names)
         for table in (self.options, self.parameters):
             for name, spec in table.specs().items():
                 node.declare_parameter(name, _ros_value(getattr(table, name)), _descriptor(name, spec),
@@ -101,6 +111,16 @@ def _taken_overrides(node: Node) -> dict[str, Any]:
 
 def _known(values: dict[str, Any], table: type[Parameters] | type[Options]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name in table.specs()}
+
+
+def _check_qos(name: str, value: Any) -> None:
+    """Raise what is wrong with an override of a policy, which rclpy would say less clearly, and later."""
+    policy = name.rpartition('.')[2]
+    values = QOS_POLICIES[policy]
+    if values and value not in values:
+        raise ValueError(f'{name} must be one of {", ".join(values)}, got {value!r}')
+    if not values and (type(value) is not int or not 0 <= value <= 10000):
+        raise ValueError(f'{name} must be a whole number of 0 to 10000, got {value!r}')
 
 
 def _warn_of_unknown(node: Node, overrides: Iterable[str], names: set[str]) -> None:

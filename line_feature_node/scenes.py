@@ -107,23 +107,28 @@ def corridor(
     Raises:
         ValueError: If the picture has no area, a number is negative or not finite, or the camera is not inside.
     """
-    _check(camera, width, height, noise=noise, seed=seed, layout=layout)
-    view, building = _View(camera, width, height), _building(layout)
+    check(camera, width, height, LOW + CLEARANCE, HIGH - CLEARANCE, noise=noise, seed=seed, layout=layout)
+    view, building = View(camera, width, height), _building(layout)
     picture = _exposure(view, building) + _texture(view, building)[..., None]
-    grain = np.random.default_rng(seed).standard_normal((height, width, 1), np.float32)
-    image = np.clip(np.rint(picture + np.float32(noise) * grain), 0, 255).astype(np.uint8)
-    return Scene(image, *_visible_edges(view, building))
+    return Scene(sensed(picture, noise, seed), *_visible_edges(view, building))
 
 
-def _check(camera: Camera, width: int, height: int, **numbers: float) -> None:
+def sensed(picture: Float32, noise: float, seed: int) -> npt.NDArray[np.uint8]:
+    """What the sensor makes of a picture (H x W x 3, grey levels): noise in whole grey levels, saturated."""
+    grain = np.random.default_rng(seed).standard_normal((*picture.shape[:2], 1), np.float32)
+    return np.asarray(np.clip(np.rint(picture + np.float32(noise) * grain), 0, 255), np.uint8)
+
+
+def check(camera: Camera, width: int, height: int, low: Float64, high: Float64, **numbers: float) -> None:
+    """Raise a ValueError for what no picture is made of: a camera outside of a box (metres), a number below 0."""
     if width < 2 or height < 2:
         raise ValueError(f'width and height must be 2 pixels or more, not {width} x {height}')
     for name, value in numbers.items():
         if not 0 <= value < np.inf:
             raise ValueError(f'{name} must be 0 or more, not {value}')
-    for name, value, low, high in zip('xyz', (camera.x, camera.y, camera.z), LOW, HIGH, strict=True):
-        if not low + CLEARANCE <= value <= high - CLEARANCE:
-            raise ValueError(f'{name} must be {low + CLEARANCE:g} to {high - CLEARANCE:g} metres, not {value}')
+    for name, value, least, most in zip('xyz', (camera.x, camera.y, camera.z), low, high, strict=True):
+        if not least <= value <= most:
+            raise ValueError(f'{name} must be {least:g} to {most:g} metres, not {value}')
     for name, value in (('yaw', camera.yaw), ('pitch', camera.pitch), ('roll', camera.roll)):
         if not np.isfinite(value):
             raise ValueError(f'{name} must be an angle in radians, not {value}')
@@ -131,7 +136,7 @@ def _check(camera: Camera, width: int, height: int, **numbers: float) -> None:
         raise ValueError(f'focal must be more than 0 pixels, not {camera.focal}')
 
 
-class _View:
+class View:
     """The geometry of one picture: from pixels to rays and from points to pixels."""
 
     def __init__(self, camera: Camera, width: int, height: int) -> None:
@@ -157,11 +162,11 @@ class _View:
     def project(self, lines: Float64) -> Float64:
         """The visible parts (M x 2 x 2, pixels) of lines (N x 2 x 3, metres)."""
         local = (lines - self.origin) @ self.axes
-        local = _clipped(local, local[..., 0] - CLEARANCE)
+        local = clipped(local, local[..., 0] - CLEARANCE)
         pixels = self.centre - self.focal * local[..., 1:] / local[..., :1]
         for axis in range(2):
-            pixels = _clipped(pixels, pixels[..., axis])
-            pixels = _clipped(pixels, self.size[axis] - 1 - pixels[..., axis])
+            pixels = clipped(pixels, pixels[..., axis])
+            pixels = clipped(pixels, self.size[axis] - 1 - pixels[..., axis])
         return pixels
 
 
@@ -173,7 +178,7 @@ def _rotation(yaw: float, pitch: float, roll: float) -> Float64:
     return np.asarray(about_z @ about_y @ about_x)
 
 
-def _clipped(lines: Float64, inside: Float64) -> Float64:
+def clipped(lines: Float64, inside: Float64) -> Float64:
     """The parts of lines (N x 2 x D) where a linear function, given at their ends (N x 2), is not negative."""
     keep = inside.max(axis=1) > 0
     lines, inside = lines[keep], inside[keep]
@@ -357,7 +362,7 @@ def _outlines(face: _Face, paint: Float32) -> Float64:
     """The lines of a face, N x 2 x 3 in metres, along which its paint changes."""
     groups = []
     for strips, (across, along) in ((paint, face.plane_axes), (paint.swapaxes(0, 1), face.plane_axes[::-1])):
-        row, start, stop = _runs((strips[1:] != strips[:-1]).any(axis=2))
+        row, start, stop = runs_of((strips[1:] != strips[:-1]).any(axis=2))
         lines = np.full((len(row), 2, 3), face.plane)
         lines[..., across] = LOW[across] + CELL * (row[:, None] + 1)
         lines[..., along] = LOW[along] + CELL * np.stack([start, stop], axis=1)
@@ -365,7 +370,7 @@ def _outlines(face: _Face, paint: Float32) -> Float64:
     return np.concatenate(groups)
 
 
-def _runs(labels: npt.NDArray[np.bool_] | Labels) -> tuple[npt.NDArray[np.intp], ...]:
+def runs_of(labels: npt.NDArray[np.bool_] | Labels) -> tuple[npt.NDArray[np.intp], ...]:
     """The runs of one label other than 0 in rows: their row, first column and the column after their last."""
     padded = np.pad(labels, ((0, 0), (1, 1)))
     before, after = padded[:, :-1], padded[:, 1:]
@@ -373,7 +378,7 @@ def _runs(labels: npt.NDArray[np.bool_] | Labels) -> tuple[npt.NDArray[np.intp],
     return row, start, np.nonzero((before != after) & (before != 0))[1]
 
 
-def _hits(view: _View, px: Float32, py: Float32) -> tuple[Float32, Float32]:
+def _hits(view: View, px: Float32, py: Float32) -> tuple[Float32, Float32]:
     """The column and row of the atlas, in cells from its corner, at which the rays through pixels end."""
     rays = view.rays(px, py)
     origin, low, high = (values.astype(np.float32) for values in (view.origin, LOW, HIGH))
@@ -394,7 +399,7 @@ def _interpolated(field: Float32, column: Float32, row: Float32, method: int) ->
     return np.asarray(cv2.remap(field, column - half, row - half, method, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
-def _radiance(view: _View, building: _Building, px: Float32, py: Float32) -> Float32:
+def _radiance(view: View, building: _Building, px: Float32, py: Float32) -> Float32:
     """The colour at places of the picture in grey levels, before lens, texture and noise."""
     column, row = _hits(view, px, py)
     cell = row.astype(np.int32) * np.int32(building.paint.shape[1]) + column.astype(np.int32)
@@ -404,7 +409,7 @@ def _radiance(view: _View, building: _Building, px: Float32, py: Float32) -> Flo
     return np.minimum(colour, np.float32(WHITE), out=colour)
 
 
-def _exposure(view: _View, building: _Building) -> Float32:
+def _exposure(view: View, building: _Building) -> Float32:
     """The picture without texture and noise, H x W x 3 in grey levels."""
     picture = np.zeros((*view.size[::-1], 3), np.float32)
     for k in range(SAMPLES):
@@ -414,7 +419,7 @@ def _exposure(view: _View, building: _Building) -> Float32:
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), BLUR), np.float32)
 
 
-def _texture(view: _View, building: _Building) -> Float32:
+def _texture(view: View, building: _Building) -> Float32:
     """The texture of the surfaces, H x W in grey levels, faded out where its grain is finer than the pixels."""
     column, row = _hits(view, view.px, view.py)
     cells = np.max([np.abs(slope) for field in (column, row) for slope in np.gradient(field)], axis=0)
@@ -425,31 +430,35 @@ def _texture(view: _View, building: _Building) -> Float32:
     return np.asarray(sum(layers), np.float32)
 
 
-def _visible_edges(view: _View, building: _Building) -> tuple[Float64, Float64]:
+def _visible_edges(view: View, building: _Building) -> tuple[Float64, Float64]:
     """The edges in the picture, truth and weak, each N x 4."""
     edges = view.project(building.lines)
     if not len(edges):
         return np.empty((0, 4)), np.empty((0, 4))
-    near, wide = (_contrast(view, building, edges, reach) for reach in (NEAR, WIDE))
+    return graded(edges, *(_contrast(view, building, edges, reach) for reach in (NEAR, WIDE)))
+
+
+def graded(edges: Float64, near: Float32, wide: Float32) -> tuple[Float64, Float64]:
+    """Truth and weak, each N x 4, of edges (N x 2 x 2), given their contrast at evenly spaced places, N x S."""
     sign = np.sign(near).astype(np.int8)  # where it changes, an edge ends and another begins
     there, strong = np.abs(near) >= WEAK_CONTRAST, np.abs(near) >= TRUTH_CONTRAST
-    strong &= ~_crowded(edges, sign * strong) & (sign * wide >= TRUTH_CONTRAST)
-    parts = _parts(edges, sign * strong)
-    long = _lengths(parts) >= SHORTEST
-    weak = np.concatenate([parts[~long], _parts(edges, sign * (there & ~strong))])
-    return parts[long].reshape(-1, 4), weak[_lengths(weak) >= SPECK].reshape(-1, 4)
+    strong &= ~is_crowded(edges, sign * strong) & (sign * wide >= TRUTH_CONTRAST)
+    parts = parts_of(edges, sign * strong)
+    long = lengths_of(parts) >= SHORTEST
+    weak = np.concatenate([parts[~long], parts_of(edges, sign * (there & ~strong))])
+    return parts[long].reshape(-1, 4), weak[lengths_of(weak) >= SPECK].reshape(-1, 4)
 
 
-def _lengths(edges: Float64) -> Float64:
+def lengths_of(edges: Float64) -> Float64:
     return np.hypot(edges[:, 1, 0] - edges[:, 0, 0], edges[:, 1, 1] - edges[:, 0, 1])
 
 
-def _contrast(view: _View, building: _Building, edges: Float64, reach: float) -> Float32:
+def _contrast(view: View, building: _Building, edges: Float64, reach: float) -> Float32:
     """The step in grey levels across edges (N x 2 x 2) at evenly spaced places along them, N x S."""
     count = int(np.ceil(np.hypot(*view.size) / STEP))
     along = edges[:, 1:] - edges[:, :1]
     middle = edges[:, :1] + along * ((np.arange(count) + 0.5) / count)[:, None]
-    normal = along[..., ::-1] * (-1, 1) / np.maximum(_lengths(edges), 1e-9)[:, None, None]
+    normal = along[..., ::-1] * (-1, 1) / np.maximum(lengths_of(edges), 1e-9)[:, None, None]
     sides = []
     for side in (-reach, reach):
         px, py = np.moveaxis((middle + side * normal).astype(np.float32), -1, 0)
@@ -457,21 +466,21 @@ def _contrast(view: _View, building: _Building, edges: Float64, reach: float) ->
     return np.asarray(sides[1] - sides[0], np.float32)
 
 
-def _parts(edges: Float64, labels: Labels) -> Float64:
+def parts_of(edges: Float64, labels: Labels) -> Float64:
     """The parts (M x 2 x 2) of edges (N x 2 x 2) that bear one label other than 0, given at places, N x S."""
-    row, start, stop = _runs(labels)
+    row, start, stop = runs_of(labels)
     shares = np.stack([start, stop], axis=1)[..., None] / labels.shape[1]
     return np.asarray(edges[row, :1] + shares * (edges[row, 1:] - edges[row, :1]))
 
 
-def _crowded(edges: Float64, labels: Labels) -> npt.NDArray[np.bool_]:
+def is_crowded(edges: Float64, labels: Labels) -> npt.NDArray[np.bool_]:
     """Whether labelled places (N x S) along edges have a labelled part of a parallel edge too near beside them."""
-    parts = _parts(edges, labels)
-    lengths = np.maximum(_lengths(parts), 1e-9)
+    parts = parts_of(edges, labels)
+    lengths = np.maximum(lengths_of(parts), 1e-9)
     units = (parts[:, 1] - parts[:, 0]) / lengths[:, None]
     low, high = parts.min(axis=1) - CROWDED, parts.max(axis=1)
     crowded = np.zeros(labels.shape, bool)
-    for part, (row, start, stop) in enumerate(zip(*_runs(labels), strict=True)):
+    for part, (row, start, stop) in enumerate(zip(*runs_of(labels), strict=True)):
         beside = (low <= high[part]).all(axis=1) & (low[part] <= high).all(axis=1)
         beside &= np.abs(units @ units[part]) > PARALLEL
         beside[part] = False
