@@ -88,10 +88,11 @@ def image_of(message: Any) -> NDArray[Any]:
     if encoding is None:
         raise ValueError(f'unknown encoding {message.encoding!r}: expected one of {", ".join(ENCODINGS)}')
     pixels = _pixels_of(message, encoding)
+    # OpenCV overlooks the byte order, and a step that is not a multiple of the numbers' size.
+    if not pixels.dtype.isnative or message.step % pixels.itemsize:
+        pixels = pixels.astype(pixels.dtype.newbyteorder('='))
     if encoding.conversion is None:
         return pixels[..., encoding.luma]
-    if not pixels.dtype.isnative:
-        pixels = pixels.astype(pixels.dtype.newbyteorder('='))
     return np.asarray(cv2.cvtColor(pixels, encoding.conversion))
 
 
@@ -210,6 +211,17 @@ def known_pixels(image: NDArray[Any]) -> NDArray[np.bool_] | None:
     if image.dtype.kind != 'f' or cv2.checkRange(image)[0]:
         return None
     return np.asarray(np.isfinite(image))
+
+
+def usable_pixels(image: NDArray[Any], mask: NDArray[np.uint8] | None) -> NDArray[Any] | None:
+    """A mask of the pixels that are finite and not masked; None where all are.
+
+    A mask of another shape is left for the extractor to refuse.
+    """
+    known = known_pixels(image)
+    if known is None or mask is None or known.shape != mask.shape:
+        return known if mask is None else mask
+    return np.asarray(known & (mask != 0))
 
 
 def range_hint(image: NDArray[Any], parameters: Parameters) -> str:

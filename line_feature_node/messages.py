@@ -14,7 +14,7 @@ from line_feature_node.overlay import COLOURS
 #: Types of numbers as sensor_msgs/PointField has them.
 POINT_TYPES = {np.dtype(np.uint32): 6, np.dtype(np.float32): 7}
 #: visualization_msgs/ImageMarker: pairs of points are lines; add, which replaces what was drawn before.
-LINE_LIST, ADD = 3, 0
+LINE_LIST, ADD = 2, 0
 #: Pixels a drawn line is wide.
 LINE_WIDTH = 2.0
 

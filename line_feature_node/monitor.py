@@ -25,6 +25,29 @@ class Level(IntEnum):
     ERROR = 2
 
 
+class Throttle:
+    """Keeps what may be said every so often from being said more often; each node has its own."""
+
+    def __init__(self, period: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """Make it.
+
+        Args:
+            period: Seconds between two sayings of one kind.
+            clock: Seconds.
+        """
+        self._period = period
+        self._clock = clock
+        self._said: dict[str, float] = {}
+
+    def allows(self, kind: str) -> bool:
+        """Whether something of a kind may be said now; then it counts as said."""
+        now = self._clock()
+        if now - self._said.get(kind, -np.inf) < self._period:
+            return False
+        self._said[kind] = now
+        return True
+
+
 @dataclass(frozen=True)
 class Health:
     """The state of the node in a form for people and plots.

@@ -32,9 +32,9 @@ from visualization_msgs.msg import ImageMarker
 
 from line_feature_node.core import LineFeatureExtractor
 from line_feature_node.files import read_mask
-from line_feature_node.images import compressed_image_of, displayable, image_of, known_pixels, range_hint
+from line_feature_node.images import compressed_image_of, displayable, image_of, range_hint, usable_pixels
 from line_feature_node.messages import Messages
-from line_feature_node.monitor import Monitor
+from line_feature_node.monitor import Monitor, Throttle
 from line_feature_node.node_parameters import QOS_OVERRIDES, QOS_POLICIES, NodeParameters
 from line_feature_node.overlay import draw_overlay
 
@@ -83,6 +83,9 @@ class LineFeatureNode(LifecycleNode):
 
     All work is done in the callbacks of one executor, which is to be single-threaded. With `autostart` the node is
     active when the constructor returns; its kernels are compiled by then.
+
+    Attributes:
+        throttle: Keeps its log from being flooded.
     """
 
     def __init__(self, node_name: str = 'line_feature_node', **options: Any) -> None:
@@ -102,8 +105,10 @@ class LineFeatureNode(LifecycleNode):
         self._subscription: Any = None
         self._active = False
         self._problem = ''
+        self._hinted = False
         self._mask: NDArray[np.uint8] | None = None
         self._monitor = Monitor()
+        self.throttle = Throttle(THROTTLE)
         try:
             self._settings = NodeParameters(self, self._qos_names(), self._on_parameters)
         except (TypeError, ValueError) as error:
@@ -150,11 +155,11 @@ class LineFeatureNode(LifecycleNode):
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Read the mask, compile the kernels and make the publishers."""
-        return self._attempt(self._configure, 'configured')
+        return self._attempt(self._configure, self._clean_up, 'configured')
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to process images."""
-        return self._attempt(self._activate, 'activated')
+        return self._attempt(self._activate, self._deactivate, 'activated')
 
     def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Stop processing images; parameters and publishers stay."""
@@ -176,14 +181,14 @@ class LineFeatureNode(LifecycleNode):
         """Begin anew after an error in a transition."""
         return self.on_shutdown(_state)
 
-    def _attempt(self, work: Callable[[], None], done: str) -> TransitionCallbackReturn:
-        """Do the work of a transition; what goes wrong is a sentence in the log, and the transition fails."""
+    def _attempt(self, work: Callable[[], None], undo: Callable[[], None], done: str) -> TransitionCallbackReturn:
+        """Do the work of a transition; what goes wrong is a sentence in the log, and it is undone."""
         try:
             work()
         except (OSError, RuntimeError, TypeError, ValueError) as error:
             self._problem = str(error)
             self.get_logger().error(f'cannot be {done}: {error}')
-            self._clean_up()
+            undo()
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
@@ -232,14 +237,17 @@ class LineFeatureNode(LifecycleNode):
     # Topics
 
     def _image_topic(self) -> str:
-        topic = self.resolve_topic_name('image')
-        return f'{topic}/compressed' if self._settings.options.image_transport == 'compressed' else str(topic)
+        compressed = self._settings.options.image_transport == 'compressed'
+        return self._compressed_topic() if compressed else str(self.resolve_topic_name('image'))
+
+    def _compressed_topic(self) -> str:
+        """That beside the raw images, wherever these are remapped to, unless it is remapped itself."""
+        return str(self.resolve_topic_name(f'{self.resolve_topic_name("image")}/compressed'))
 
     def _qos_names(self) -> list[str]:
         """Names of the parameters that override quality of service."""
-        image = self.resolve_topic_name('image')
         topics = [(self.resolve_topic_name(topic), 'publisher') for topic in OUTPUTS]
-        topics += [(image, 'subscription'), (f'{image}/compressed', 'subscription')]
+        topics += [(topic, 'subscription') for topic in (self.resolve_topic_name('image'), self._compressed_topic())]
         return [f'{QOS_OVERRIDES}{topic}.{end}.{policy}' for topic, end in topics for policy in QOS_POLICIES]
 
     def _update_subscription(self) -> None:
@@ -307,7 +315,7 @@ class LineFeatureNode(LifecycleNode):
         self._monitor.receive(info.get('publication_sequence_number') if alone else None)
         try:
             image = decode(message)
-            segments = self._extractor.extract(image, self._mask_for(image))
+            segments = self._extractor.extract(image, usable_pixels(image, self._mask))
         except (cv2.error, MemoryError, TypeError, ValueError) as error:
             self._on_bad_frame(message, error)
             return
@@ -323,24 +331,19 @@ class LineFeatureNode(LifecycleNode):
         if image.dtype.kind == 'u' and image.itemsize == 2 and self._monitor.counts.processed % HINT_EVERY == 1:
             self._hint(image)
 
-    def _mask_for(self, image: NDArray[Any]) -> NDArray[Any] | None:
-        known, mask = known_pixels(image), self._mask
-        if known is None or mask is None or known.shape != mask.shape:
-            return known if mask is None else mask
-        return known & (mask != 0)
-
     def _on_bad_frame(self, message: Any, error: Exception) -> None:
         stamp = message.header.stamp
         reason = ' '.join(str(error).split()) or type(error).__name__
         self._monitor.fail(reason)
-        self.get_logger().warning(
-            f'image on {self._image_topic()} with stamp {stamp.sec}.{stamp.nanosec:09d} is left out: {reason}',
-            throttle_duration_sec=THROTTLE)
+        if self.throttle.allows('bad frame'):
+            self.get_logger().warning(
+                f'image on {self._image_topic()} with stamp {stamp.sec}.{stamp.nanosec:09d} is left out: {reason}')
 
     def _hint(self, image: NDArray[Any]) -> None:
         hint = range_hint(image, self._extractor.parameters)
-        if hint:
-            self.get_logger().info(f'image on {self._image_topic()}: {hint}', once=True)
+        if hint and not self._hinted:
+            self._hinted = True
+            self.get_logger().info(f'image on {self._image_topic()}: {hint}')
 
     def _publish(self, topic: str, make: Callable[[], Any]) -> None:
         """Publish what is made, if anybody listens: publish() serialises even when nobody does."""
@@ -413,8 +416,8 @@ def _spin_while_all_is_well(node: LineFeatureNode, executor: SingleThreadedExecu
     except (KeyboardInterrupt, ExternalShutdownException):
         node.context.try_shutdown()
     except Exception as error:  # noqa: BLE001
-        if node.context.ok():
-            node.get_logger().error(f'a callback failed: {error!r}', throttle_duration_sec=THROTTLE)
+        if node.context.ok() and node.throttle.allows('callback'):
+            node.get_logger().error(f'a callback failed: {error!r}')
 
 
 def run(args: list[str], stop: object = False) -> int:

@@ -1,5 +1,6 @@
 """The tables of parameters as parameters of a ROS 2 node: declared, checked together, and swapped as one."""
 
+import array
 import dataclasses
 import difflib
 import math
@@ -69,8 +70,7 @@ class NodeParameters:
 
     def _complete(self, changes: list[Parameter]) -> list[Parameter]:
         """Numbers as the type they are wanted in, and with a profile all values that it sets."""
-        completed = [change if change.name not in _NAMES or change.type_ == Parameter.Type.NOT_SET
-                     else _parameter(change.name, _converted(change.name, change.value)) for change in changes]
+        completed = [_completed(change) for change in changes]
         given = {change.name for change in changes}
         for change in completed:
             if change.name == 'profile' and change.value in Options.specs()['profile'].choices:
@@ -126,8 +126,9 @@ def _check_qos(name: str, value: Any) -> None:
 def _warn_of_unknown(node: Node, overrides: Iterable[str], names: set[str]) -> None:
     for name in overrides:
         if name not in names:
-            similar = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-            hint = f': did you mean {similar[0]!r}?' if similar else ''
+            similar = {known.lower(): known for known in names}
+            closest = difflib.get_close_matches(name.lower(), similar, n=1, cutoff=0.5)
+            hint = f': did you mean {similar[closest[0]]!r}?' if closest else ''
             node.get_logger().warning(f'there is no parameter {name!r}, what it is set to has no effect{hint}')
 
 
@@ -141,13 +142,21 @@ def _converted(name: str, value: Any) -> Any:
         return float(value)
     if type(default) is int and isinstance(value, float) and value.is_integer():
         return int(value)
-    if isinstance(default, tuple) and not isinstance(value, str) and hasattr(value, '__len__'):
-        return [float(item) if type(item) is int else item for item in value]
+    if isinstance(default, tuple) and isinstance(value, array.array) and value.typecode != 'd' and len(value):
+        return [float(item) for item in value]
     return value
 
 
 def _ros_value(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
+
+
+def _completed(change: Parameter) -> Parameter:
+    """A change as its table wants it; what needs no conversion is left as it came, whatever it is."""
+    if change.name not in _NAMES or not isinstance(change.value, int | float | array.array):
+        return change
+    value = _converted(change.name, change.value)
+    return change if value is change.value else _parameter(change.name, value)
 
 
 def _parameter(name: str, value: Any) -> Parameter:

@@ -279,7 +279,6 @@ def test_each_segment_is_a_line_between_its_end_points(messages, header):
         assert (second.x, second.y, second.z) == (segment['x2'], segment['y2'], 0)
 
 
-@pytest.mark.xfail(strict=True, reason='LINE_LIST of ImageMarker is 2; 3 is POLYGON')
 def test_constants_are_those_of_the_message():
     pytest.importorskip('visualization_msgs.msg')
     message = LIBRARIES['ros']().markers(some_segments(), ros('std_msgs/msg/Header')())

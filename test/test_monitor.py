@@ -1,7 +1,7 @@
 import pytest
 
 from line_feature_node.core import STEPS
-from line_feature_node.monitor import LARGEST_JUMP, WINDOW, Level, Monitor
+from line_feature_node.monitor import LARGEST_JUMP, WINDOW, Level, Monitor, Throttle
 from line_feature_node.options import Options
 
 TIMES = dict(zip(STEPS, (0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007), strict=True))
@@ -306,3 +306,10 @@ def test_the_clock_runs_by_itself_where_none_is_given():
     before = Monitor()
     assert health(before).level == Level.OK
     assert before.clock() <= before.clock()
+
+
+def test_throttle_lets_each_kind_through_once_a_period():
+    times = iter([0.0, 1.0, 1.0, 4.9, 5.0, 5.1, 6.0])
+    throttle = Throttle(5.0, lambda: next(times))
+    kinds = ['frame', 'frame', 'callback', 'frame', 'frame', 'frame', 'callback']
+    assert [throttle.allows(kind) for kind in kinds] == [True, False, True, False, True, False, True]
