@@ -49,7 +49,7 @@ bench: $(PEERS)/.installed
 
 # Latency, loss and load of the node beside those of an empty one, and five minutes of it as a curve.
 bench-node: $(PEERS)/.installed
-	$(PEERS)/bin/python bench/node.py --results bench/results
+	$(PEERS)/bin/python bench/node.py --soak 5 --results bench/results
 
 # The tables in the README, the files of config/, and the pictures in docs/.
 docs: install

@@ -11,8 +11,8 @@ import numpy as np
 from line_feature_node.core import STEPS
 from line_feature_node.options import Options
 
-#: How many of the latest frames the percentiles are of.
-WINDOW = 300
+#: The percentiles are of the latest frames, at most so many, and at most so many seconds old.
+WINDOW, AGE = 1000, 5.0
 #: A jump of the sequence number by more is a publisher that began anew, not a loss.
 LARGEST_JUMP = 10000
 
@@ -90,8 +90,7 @@ class Monitor:
 
     def __post_init__(self) -> None:
         self._sequence: int | None = None
-        self._latencies: deque[float] = deque(maxlen=WINDOW)
-        self._steps: deque[tuple[float, ...]] = deque(maxlen=WINDOW)
+        self._recent: deque[tuple[float, float, tuple[float, ...]]] = deque(maxlen=WINDOW)  # when, latency, steps
         self._segments = 0
         self._reported = Counts()
         self._reported_at = self._last_image = self.clock()
@@ -124,8 +123,7 @@ class Monitor:
             segments: How many there are.
         """
         self.counts.processed += 1
-        self._latencies.append(latency)
-        self._steps.append(tuple(times[step] for step in STEPS))
+        self._recent.append((self.clock(), latency, tuple(times[step] for step in STEPS)))
         self._segments = segments
 
     def fail(self, reason: str) -> None:
@@ -145,6 +143,8 @@ class Monitor:
             waiting: What the node waits for while it is not subscribed.
         """
         now, latest = self.clock(), self.counts
+        while self._recent and now - self._recent[0][0] > AGE:
+            self._recent.popleft()
         elapsed = max(now - self._reported_at, 1e-9)
         since = Counts(**{name: count - getattr(self._reported, name) for name, count in vars(latest).items()})
         self._reported, self._reported_at = Counts(**vars(latest)), now
@@ -173,10 +173,11 @@ class Monitor:
         return Level.OK, f'{self._segments} segments in the last image'
 
     def _percentile(self, percent: float) -> float:
-        return float(np.percentile(self._latencies, percent)) if self._latencies else 0.0
+        return float(np.percentile([latency for _, latency, _ in self._recent], percent)) if self._recent else 0.0
 
     def _values(self, rate: float) -> dict[str, str]:
-        times = np.median(self._steps, axis=0) * 1e3 if self._steps else np.zeros(len(STEPS))
+        steps = [steps for _, _, steps in self._recent]
+        times = np.median(steps, axis=0) * 1e3 if steps else np.zeros(len(STEPS))
         return {
             **{f'frames {name}': str(count) for name, count in vars(self.counts).items()},
             'rate (Hz)': f'{rate:.1f}',

@@ -1,7 +1,10 @@
 """The ROS 2 node: an image topic in, segments, markers, an overlay and edges out."""
 
 import array
+import contextlib
+import ctypes
 import importlib
+import os
 import signal
 import sys
 import time
@@ -36,7 +39,7 @@ from line_feature_node.images import compressed_image_of, displayable, image_of,
 from line_feature_node.messages import Messages
 from line_feature_node.monitor import Monitor, Throttle
 from line_feature_node.node_parameters import QOS_OVERRIDES, QOS_POLICIES, NodeParameters
-from line_feature_node.overlay import draw_overlay
+from line_feature_node.overlay import draw_overlay, encode_jpeg
 
 RCLError, UnknownROSArgsError = rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError
 
@@ -53,6 +56,8 @@ POLICIES = [QoSPolicyKind[name.upper()] for name in QOS_POLICIES]
 THROTTLE = 5.0
 #: How many outputs wait for a subscriber that is slow.
 OUTPUT_DEPTH = 5
+#: Of glibc's malloc.h: the largest block that comes from the heap, and how much of its end may lie unused.
+MALLOC_OPTIONS = ((-3, 'MMAP', 32 << 20), (-1, 'TRIM', 256 << 20))
 #: Frames after which a 16-bit stream is looked at again, whether it uses its range.
 HINT_EVERY = 100
 
@@ -328,7 +333,7 @@ class LineFeatureNode(LifecycleNode):
             height, width = image.shape
             self.get_logger().info(f'first image: {width}×{height} {form()}, {len(segments)} segments')
         self._publish_pictures(image, segments, message.header, (time.time_ns() - begin) * 1e-6)
-        if image.dtype.kind == 'u' and image.itemsize == 2 and self._monitor.counts.processed % HINT_EVERY == 1:
+        if image.dtype != np.uint8 and self._monitor.counts.processed % HINT_EVERY == 1:
             self._hint(image)
 
     def _on_bad_frame(self, message: Any, error: Exception) -> None:
@@ -360,13 +365,16 @@ class LineFeatureNode(LifecycleNode):
             return draw_overlay(picture, segments, f'{len(segments)} segments, {milliseconds:.1f} ms')
 
         def compressed() -> NDArray[np.uint8]:
-            quality = [cv2.IMWRITE_JPEG_QUALITY, self._settings.options.jpeg_quality]
-            return np.asarray(cv2.imencode('.jpg', overlay(), quality)[1], np.uint8)
+            return encode_jpeg(overlay(), self._settings.options.jpeg_quality)
 
-        self._publish('~/markers', lambda: MESSAGES.markers(segments, header))
-        self._publish('~/overlay', lambda: MESSAGES.image(overlay(), header))
-        self._publish('~/overlay/compressed', lambda: MESSAGES.compressed_image(compressed(), header))
-        self._publish('~/edges', lambda: MESSAGES.image(self._extractor.edges(), header))
+        try:
+            self._publish('~/markers', lambda: MESSAGES.markers(segments, header))
+            self._publish('~/overlay', lambda: MESSAGES.image(overlay(), header))
+            self._publish('~/edges', lambda: MESSAGES.image(self._extractor.edges(), header))
+            self._publish('~/overlay/compressed', lambda: MESSAGES.compressed_image(compressed(), header))
+        except (cv2.error, MemoryError, ValueError) as error:
+            if self.throttle.allows('picture'):
+                self.get_logger().warning(f'a picture of the segments cannot be made: {" ".join(str(error).split())}')
 
     # Diagnostics
 
@@ -395,9 +403,12 @@ def _policy(event: Any) -> str:
 
 def spin(node: LineFeatureNode) -> None:
     """Let a node work until its context is shut down."""
-    if not node.context.ok():
-        return
-    executor = SingleThreadedExecutor(context=node.context)
+    try:
+        executor = SingleThreadedExecutor(context=node.context)
+    except RCLError:
+        if node.context.ok():
+            raise
+        return  # shut down already
     executor.add_node(node)
     try:
         while node.context.ok():
@@ -427,6 +438,7 @@ def run(args: list[str], stop: object = False) -> int:
         args: Those of the command line, with its name.
         stop: Becomes true when such a signal came before the node was ready for it.
     """
+    _keep_memory()
     try:
         node = _started(args)
     except (ConfigurationError, RCLError) as error:
@@ -444,6 +456,19 @@ def run(args: list[str], stop: object = False) -> int:
         node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _keep_memory() -> None:
+    """Let the C library keep the memory of large messages, where the user has not said otherwise.
+
+    It would give that back, and the kernel zero it anew, for each frame: half of the time that a large image takes to
+    arrive (docs/transport.md). Where the library is another one than glibc, nothing is changed.
+    """
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        for number, name, size in MALLOC_OPTIONS:
+            if f'MALLOC_{name}_THRESHOLD_' not in os.environ:
+                mallopt(number, size)
 
 
 def _started(args: list[str]) -> LineFeatureNode:

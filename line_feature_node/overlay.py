@@ -12,6 +12,8 @@ from line_feature_node.core import end_points
 COLOURS = {1: (0, 94, 213), 2: (115, 158, 0), 3: (233, 180, 86), 4: (66, 228, 240)}
 #: Brightness that is left of the picture, so that the segments stand out.
 BACKGROUND = 0.7
+#: The longest side that libjpeg accepts.
+JPEG_SIDE = 65500
 #: Bits behind the binary point of the coordinates that OpenCV draws.
 SHIFT = 4
 
@@ -39,6 +41,18 @@ def draw_overlay(image: NDArray[Any], segments: NDArray[np.void], caption: str =
     if caption:
         _write(canvas, caption)
     return canvas
+
+
+def encode_jpeg(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """The bytes of a JPEG.
+
+    Raises:
+        ValueError: The picture is wider or higher than a JPEG can be.
+    """
+    if max(picture.shape[:2]) > JPEG_SIDE:
+        height, width = picture.shape[:2]
+        raise ValueError(f'{width}×{height} pixels are more than a JPEG can have, {JPEG_SIDE} a side')
+    return np.asarray(cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], np.uint8)
 
 
 def _bgr_of_grey(image: NDArray[Any]) -> NDArray[np.uint8]:

@@ -61,7 +61,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pin-hole camera in the corridor, which is 24 m long, 2.4 m wide and 2.6 m high; 5 cm or more from its faces.
+    """A pin-hole camera, by default in the corridor: 24 m long, 2.4 m wide and 2.6 m high; 5 cm or more from its faces.
 
     Attributes:
         x: Metres from the end wall behind the camera, 0 to 24; unturned, the camera looks along x.
@@ -362,7 +362,7 @@ def _outlines(face: _Face, paint: Float32) -> Float64:
     """The lines of a face, N x 2 x 3 in metres, along which its paint changes."""
     groups = []
     for strips, (across, along) in ((paint, face.plane_axes), (paint.swapaxes(0, 1), face.plane_axes[::-1])):
-        row, start, stop = runs_of((strips[1:] != strips[:-1]).any(axis=2))
+        row, start, stop = _runs((strips[1:] != strips[:-1]).any(axis=2))
         lines = np.full((len(row), 2, 3), face.plane)
         lines[..., across] = LOW[across] + CELL * (row[:, None] + 1)
         lines[..., along] = LOW[along] + CELL * np.stack([start, stop], axis=1)
@@ -370,7 +370,7 @@ def _outlines(face: _Face, paint: Float32) -> Float64:
     return np.concatenate(groups)
 
 
-def runs_of(labels: npt.NDArray[np.bool_] | Labels) -> tuple[npt.NDArray[np.intp], ...]:
+def _runs(labels: npt.NDArray[np.bool_] | Labels) -> tuple[npt.NDArray[np.intp], ...]:
     """The runs of one label other than 0 in rows: their row, first column and the column after their last."""
     padded = np.pad(labels, ((0, 0), (1, 1)))
     before, after = padded[:, :-1], padded[:, 1:]
@@ -442,14 +442,15 @@ def graded(edges: Float64, near: Float32, wide: Float32) -> tuple[Float64, Float
     """Truth and weak, each N x 4, of edges (N x 2 x 2), given their contrast at evenly spaced places, N x S."""
     sign = np.sign(near).astype(np.int8)  # where it changes, an edge ends and another begins
     there, strong = np.abs(near) >= WEAK_CONTRAST, np.abs(near) >= TRUTH_CONTRAST
-    strong &= ~is_crowded(edges, sign * strong) & (sign * wide >= TRUTH_CONTRAST)
-    parts = parts_of(edges, sign * strong)
+    strong &= ~_crowded(edges, sign * strong) & (sign * wide >= TRUTH_CONTRAST)
+    parts = _parts(edges, sign * strong)
     long = lengths_of(parts) >= SHORTEST
-    weak = np.concatenate([parts[~long], parts_of(edges, sign * (there & ~strong))])
+    weak = np.concatenate([parts[~long], _parts(edges, sign * (there & ~strong))])
     return parts[long].reshape(-1, 4), weak[lengths_of(weak) >= SPECK].reshape(-1, 4)
 
 
 def lengths_of(edges: Float64) -> Float64:
+    """The lengths of edges (N x 2 x 2)."""
     return np.hypot(edges[:, 1, 0] - edges[:, 0, 0], edges[:, 1, 1] - edges[:, 0, 1])
 
 
@@ -466,21 +467,21 @@ def _contrast(view: View, building: _Building, edges: Float64, reach: float) -> 
     return np.asarray(sides[1] - sides[0], np.float32)
 
 
-def parts_of(edges: Float64, labels: Labels) -> Float64:
+def _parts(edges: Float64, labels: Labels) -> Float64:
     """The parts (M x 2 x 2) of edges (N x 2 x 2) that bear one label other than 0, given at places, N x S."""
-    row, start, stop = runs_of(labels)
+    row, start, stop = _runs(labels)
     shares = np.stack([start, stop], axis=1)[..., None] / labels.shape[1]
     return np.asarray(edges[row, :1] + shares * (edges[row, 1:] - edges[row, :1]))
 
 
-def is_crowded(edges: Float64, labels: Labels) -> npt.NDArray[np.bool_]:
+def _crowded(edges: Float64, labels: Labels) -> npt.NDArray[np.bool_]:
     """Whether labelled places (N x S) along edges have a labelled part of a parallel edge too near beside them."""
-    parts = parts_of(edges, labels)
+    parts = _parts(edges, labels)
     lengths = np.maximum(lengths_of(parts), 1e-9)
     units = (parts[:, 1] - parts[:, 0]) / lengths[:, None]
     low, high = parts.min(axis=1) - CROWDED, parts.max(axis=1)
     crowded = np.zeros(labels.shape, bool)
-    for part, (row, start, stop) in enumerate(zip(*runs_of(labels), strict=True)):
+    for part, (row, start, stop) in enumerate(zip(*_runs(labels), strict=True)):
         beside = (low <= high[part]).all(axis=1) & (low[part] <= high).all(axis=1)
         beside &= np.abs(units @ units[part]) > PARALLEL
         beside[part] = False

@@ -140,8 +140,8 @@ def expected_grey(pixels, encoding):
     return luminance(*(pixels[..., names.index(name)].astype(float) for name in 'rgb')), tolerance
 
 
-@pytest.mark.parametrize(('encoding', 'padding', 'width', 'big'), itertools.product(
-    ENCODINGS, PADDINGS, WIDTHS, (False, True)))
+@pytest.mark.parametrize(('encoding', 'padding', 'width', 'big'), list(itertools.product(
+    ENCODINGS, PADDINGS, WIDTHS, (False, True))))
 def test_grey_picture_of_every_encoding(encoding, padding, width, big):
     pixels = pixels_for(encoding, HEIGHT, width)
     grey = image_of(message_of(pixels, encoding, padding, big))

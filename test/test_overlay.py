@@ -1,8 +1,9 @@
+import cv2
 import numpy as np
 import pytest
 
 from line_feature_node.core import SEGMENT_DTYPE
-from line_feature_node.overlay import BACKGROUND, COLOURS, draw_overlay
+from line_feature_node.overlay import BACKGROUND, COLOURS, JPEG_SIDE, draw_overlay, encode_jpeg
 
 
 def segment(x1, y1, x2, y2, code):
@@ -45,3 +46,15 @@ def test_the_image_is_left_as_it_was():
     image = np.full((60, 80, 3), 100, np.uint8)
     draw_overlay(image, segment(1, 1, 50, 50, 1), 'text')
     assert np.all(image == 100)
+
+
+def test_jpeg_of_an_overlay():
+    picture = draw_overlay(np.full((60, 80), 100, np.uint8), segment(10, 30, 70, 30, 1))
+    small, large = (encode_jpeg(picture, quality) for quality in (20, 95))
+    assert cv2.imdecode(large, cv2.IMREAD_COLOR).shape == picture.shape
+    assert small.size < large.size
+
+
+def test_a_picture_too_wide_for_a_jpeg_is_said_so():
+    with pytest.raises(ValueError, match=f'65501×1 pixels are more than a JPEG can have, {JPEG_SIDE} a side'):
+        encode_jpeg(np.zeros((1, JPEG_SIDE + 1, 3), np.uint8), 80)
