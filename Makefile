@@ -35,7 +35,7 @@ test-all:
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/ament_flake8 --config setup.cfg setup.py line_feature_node bench docs test
+	$(BIN)/ament_flake8 --config setup.cfg setup.py line_feature_node bags bench docs test
 	$(BIN)/ament_pep257 --ignore $(PEP257_IGNORE) -- setup.py line_feature_node
 
 # Build, test and check the package as a colcon workspace has it; .ci/colcon says what is checked.

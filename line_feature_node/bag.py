@@ -1,0 +1,362 @@
+"""The offline run over a recording: slices to workers, what comes back to a bag, and nothing half done.
+
+Beside the target there is a folder for what is under way, with a file for each slice that is done, so that a run that
+was killed can go on. The target is there when all of it is, by a rename.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import heapq
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from line_feature_node.core import SEGMENT_DTYPE
+from line_feature_node.recordings import RecordingError, Slice, is_ros1, opened, plan, typestore
+from line_feature_node.slices import CSV, OUTPUTS, Frame, Job, process_slice, unpack
+from line_feature_node.workers import Workers, in_order, inline
+
+#: What is offered with results, as the node does: reliable, of depth 5.
+QOS = Qos(QosHistory.KEEP_LAST, 5, QosReliability.RELIABLE, QosDurability.VOLATILE, QosTime(0, 0), QosTime(0, 0),
+          QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), avoid_ros_namespace_conventions=False)
+#: Latest version of the metadata of bags.
+VERSION: Literal[9] = 9
+#: What is said of a recording without images, or without any in the time that was asked for.
+NO_IMAGES = 'no images to be processed'
+#: Overlays that are kept for the report.
+SAMPLES = 8
+
+
+class TargetError(OSError):
+    """The result cannot be written where it is to be; the message is a sentence for users."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is asked for, of one recording or many.
+
+    Attributes:
+        job: What is done with every slice.
+        topics: Topics of images; empty for all.
+        start, end: Seconds from the beginning of a recording.
+        every: One of so many frames is processed.
+        storage: 'mcap' or 'sqlite3'.
+        copy: Whether everything of the input is copied, too.
+        overwrite: Whether a target that exists is replaced.
+        resume: Whether what an earlier run left is used.
+    """
+
+    job: Job
+    topics: tuple[str, ...] = ()
+    start: float | None = None
+    end: float | None = None
+    every: int = 1
+    storage: str = 'mcap'
+    copy: bool = False
+    overwrite: bool = False
+    resume: bool = False
+
+
+@dataclass
+class Outcome:
+    """What became of a recording.
+
+    Attributes:
+        source, target: The recording and the bag that was made of it.
+        frames: All of them, without their messages.
+        overlays: Bytes of JPEGs of some frames, with their topic and stamp.
+        error: Why nothing came of it, one sentence; '' where something did.
+        uncopied: Topics that could not be copied.
+    """
+
+    source: Path
+    target: Path
+    frames: list[Frame] = field(default_factory=list)
+    overlays: list[tuple[str, int, bytes]] = field(default_factory=list)
+    error: str = ''
+    uncopied: list[str] = field(default_factory=list)
+
+    @property
+    def failed(self) -> Counter[str]:
+        """How many frames failed, by reason."""
+        return Counter(frame.error for frame in self.frames if frame.error)
+
+    @property
+    def segments(self) -> int:
+        """How many segments were found."""
+        return sum(frame.segments for frame in self.frames)
+
+
+def process_recording(
+    source: Path, target: Path, run: Run, workers: Workers, watch: Callable[[int, int, Frame | None], None],
+) -> Outcome:
+    """Process one recording into a bag.
+
+    Args:
+        source: The recording.
+        target: The folder of the bag.
+        run: What is asked for.
+        workers: Who does the work.
+        watch: Told of each frame that is done, with the number of slices and of those that are done; None for no frame.
+
+    Raises:
+        RecordingError: The recording cannot be read.
+        TargetError: The target exists, or cannot be written.
+        WorkersError: The workers die.
+    """
+    if target.exists() and not run.overwrite:
+        raise TargetError(f'{target} exists: --overwrite replaces it')
+    slices = plan(source, topics=list(run.topics), start=run.start, end=run.end, every=run.every)
+    outcome = Outcome(source, target)
+    if not slices:
+        outcome.error = NO_IMAGES
+        return outcome
+    with _told(target), _Work(source, target, run, slices) as work:
+        for number, data in enumerate(work.results(workers)):
+            for frame in work.write(number, unpack(data), outcome):
+                watch(number, len(slices), frame)
+            watch(number + 1, len(slices), None)
+        outcome.uncopied = work.uncopied
+        work.finish()
+    return outcome
+
+
+@contextlib.contextmanager
+def _told(target: Path) -> Iterator[None]:
+    """Make a sentence of what the file system says."""
+    try:
+        yield
+    except (TargetError, RecordingError):
+        raise
+    except OSError as error:
+        raise TargetError(f'cannot write {target}: {error.strerror or error}') from error
+
+
+class _Work:
+    """The folder for what is under way, and the bag in it that is being written."""
+
+    def __init__(self, source: Path, target: Path, run: Run, slices: list[Slice]) -> None:
+        self._target = target
+        self._run = run
+        self._slices = slices
+        self._folder = target.with_name(f'{target.name}.partial')
+        self._journal = self._folder / 'slices'
+        self._bag = self._folder / 'bag' / target.name  # the file in it has the name of its folder
+        self._lock = -1
+        self._writer: Any = None
+        self._source = source
+        self._stack = contextlib.ExitStack()
+        self._offsets = dict.fromkeys(slices[0].topics, 0)
+        self.uncopied: list[str] = []
+
+    def __enter__(self) -> '_Work':
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._lock = os.open(self._folder / 'lock', os.O_CREAT | os.O_RDWR)
+        try:
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise TargetError(f'another run is writing {self._target}') from None
+            self._begin()
+        except BaseException:
+            os.close(self._lock)
+            raise
+        return self
+
+    def _begin(self) -> None:
+        described = json.dumps(self._description(), default=str, sort_keys=True)
+        record = self._folder / 'run.json'
+        if self._run.resume and record.exists() and record.read_text() != described:
+            raise TargetError(f'{self._folder} is of a run with other settings or another recording: remove it, '
+                              f'or run without --resume')
+        if not self._run.resume:
+            shutil.rmtree(self._journal, ignore_errors=True)
+        shutil.rmtree(self._bag.parent, ignore_errors=True)
+        self._journal.mkdir(exist_ok=True)
+        _write_whole(record, described.encode())
+        self._writer = Writer(self._bag, version=VERSION,
+                              storage_plugin=StoragePlugin[self._run.storage.upper()])
+        if self._run.storage == 'mcap':
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer.open()
+        self._connections = {
+            (topic, name): self._writer.add_connection(
+                f'{topic}/{name}', OUTPUTS[name], typestore=typestore(ros1=False), offered_qos_profiles=[QOS])
+            for topic in self._slices[0].topics for name in self._run.job.outputs}
+        self._copier = _Copier(self._stack.enter_context(opened(self._source)), self._source, self._writer,
+                               {f'{topic}/{name}' for topic, name in self._connections}) if self._run.copy else None
+        if self._copier:
+            self.uncopied = self._copier.left_out
+        self._csv = None
+        if self._run.job.csv:
+            self._csv = self._stack.enter_context((self._folder / 'segments.csv').open('w', newline=''))
+            self._csv.write(','.join(('stamp', 'topic', 'frame', *(SEGMENT_DTYPE.names or ()))) + '\n')
+
+    def _description(self) -> dict[str, Any]:
+        """All that the results of the slices depend on."""
+        files = [self._source] if self._source.is_file() else sorted(self._source.iterdir())
+        mask = self._run.job.mask
+        job = {**asdict(self._run.job), 'mask': '' if mask is None else hashlib.sha256(mask.tobytes()).hexdigest()}
+        return {'files': [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files], 'job': job,
+                'slices': [asdict(part) for part in self._slices]}
+
+    def results(self, workers: Workers) -> Iterator[bytes]:
+        """What was made of each slice, in order; what an earlier run made is taken from the journal."""
+        paths = [self._journal / f'{number:06d}' for number in range(len(self._slices))]
+        missing = [number for number, path in enumerate(paths) if not path.exists()]
+        if len(missing) == 1:
+            workers = inline()
+        made = in_order(workers, process_slice, [(self._slices[number], self._run.job) for number in missing])
+        for number, path in enumerate(paths):
+            if number not in set(missing):
+                yield path.read_bytes()
+            else:
+                data = next(made)
+                _write_whole(path, data)
+                yield data
+
+    def write(self, number: int, frames: list[Frame], outcome: Outcome) -> Iterator[Frame]:
+        """Write what was made of a slice, and what is copied of its time, in the order of time."""
+        part = self._slices[number]
+        for frame in frames:
+            if not part.skipped:
+                frame.number += self._offsets[frame.topic]
+        for topic in self._offsets:
+            self._offsets[topic] += sum(frame.topic == topic for frame in frames)
+        self._write_messages(number, part, frames)
+        sampled = number in {len(self._slices) * k // SAMPLES for k in range(SAMPLES)}
+        for frame in frames:
+            self._write_text(frame)
+            overlay = frame.messages.get('overlay')
+            if overlay and sampled:
+                sampled = False
+                outcome.overlays.append((frame.topic, frame.stamp, overlay))
+            bare = replace(frame, messages={})
+            outcome.frames.append(bare)
+            yield bare
+
+    def _write_messages(self, number: int, part: Slice, frames: list[Frame]) -> None:
+        made: Iterator[tuple[int, Any, Any]] = (
+            (frame.stamp, self._connections[frame.topic, name], data)
+            for frame in frames for name, data in frame.messages.items() if name != CSV)
+        if self._copier:
+            # What was before the first image, and after the last, belongs to the first and the last slice.
+            last = number == len(self._slices) - 1
+            copied = self._copier.messages(None if number == 0 and self._run.start is None else part.start,
+                                           None if last and self._run.end is None else part.stop)
+            made = heapq.merge(copied, made, key=lambda message: message[0])
+        for stamp, connection, data in made:
+            self._writer.write(connection, stamp, data)
+
+    def _write_text(self, frame: Frame) -> None:
+        if self._csv is not None and frame.messages.get(CSV):
+            head = f'{frame.stamp},{frame.topic},{frame.number},'
+            self._csv.writelines(f'{head}{line}\n' for line in frame.messages[CSV].decode().split('\n'))
+
+    def finish(self) -> None:
+        """Make the target of what was written, by a rename, and clear up."""
+        bag = self._bag
+        writer, self._writer = self._writer, None
+        writer.close()
+        self._stack.close()
+        if self._csv is not None:
+            (self._folder / 'segments.csv').rename(bag / 'segments.csv')
+        if self._target.exists():
+            old = self._folder / 'replaced'
+            self._target.rename(old)
+            bag.rename(self._target)
+        else:
+            bag.rename(self._target)
+        shutil.rmtree(self._folder)
+
+    def __exit__(self, kind: Any, *_: Any) -> None:
+        """Leave the journal for a later run where this one did not finish, and nothing else."""
+        with contextlib.suppress(Exception):
+            self._stack.close()
+        if self._writer is not None:
+            with contextlib.suppress(Exception):
+                self._writer.abort()
+            shutil.rmtree(self._bag.parent, ignore_errors=True)
+        os.close(self._lock)
+
+
+class _Copier:
+    """Copies messages of the input as they are; those of ROS 1 are serialised as ROS 2 does."""
+
+    def __init__(self, reader: Any, source: Path, writer: Writer, taken: set[str]) -> None:
+        self._reader = reader
+        self._ros1 = is_ros1(source)
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._targets: dict[int, Connection] = {}
+        self._sources: list[Connection] = []
+        self.left_out: list[str] = []
+        for connection in reader.connections:
+            if connection.topic in taken:
+                continue
+            try:
+                self._targets[connection.id] = self._add(connection, writer)
+                self._sources.append(connection)
+            except Exception:  # noqa: BLE001, definitions that are wrong make errors of all kinds
+                self.left_out.append(connection.topic)
+
+    def _add(self, connection: Connection, writer: Writer) -> Connection:
+        same = [known for known in self._targets.values()
+                if (known.topic, known.msgtype) == (connection.topic, connection.msgtype)]
+        if same:  # two publishers of one topic
+            return same[0]
+        qos = getattr(connection.ext, 'offered_qos_profiles', [])
+        if self._ros1:
+            self._learn(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+            return writer.add_connection(connection.topic, connection.msgtype, typestore=self._types)
+        if connection.msgdef.data and connection.digest:
+            return writer.add_connection(connection.topic, connection.msgtype, msgdef=connection.msgdef.data,
+                                         rihs01=connection.digest, offered_qos_profiles=qos)
+        return writer.add_connection(connection.topic, connection.msgtype, typestore=typestore(ros1=False),
+                                     offered_qos_profiles=qos)
+
+    def _learn(self, types: Any) -> None:
+        """Take up types of ROS 1; those that ROS 2 has must have the same fields there, whatever their names.
+
+        Raises:
+            ValueError: One has not. A header has a number in ROS 1, which is left out in the conversion.
+        """
+        known = self._types.fielddefs
+        for name, (_, fields) in types.items():
+            if (name in known and name != 'std_msgs/msg/Header'
+                    and [kind for _, kind in fields] != [kind for _, kind in known[name][1]]):
+                raise ValueError(f'{name} is another in ROS 2')
+        self._types.register({name: definition for name, definition in types.items() if name not in known})
+
+    def messages(self, start: int | None, stop: int | None) -> Iterator[tuple[int, Connection, Any]]:
+        """Stamp, connection of the new bag, and bytes of the messages in a span of time."""
+        for connection, stamp, data in self._reader.messages(self._sources, start, stop) if self._sources else ():
+            copied = bytes(self._types.ros1_to_cdr(data, connection.msgtype)) if self._ros1 else data
+            yield stamp, self._targets[connection.id], copied
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Write a file that is whole when it is there, even if the machine is switched off."""
+    beside = path.with_name(f'{path.name}.new')
+    with beside.open('wb') as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.rename(path)

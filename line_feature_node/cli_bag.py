@@ -1,0 +1,200 @@
+"""The command `line_features bag`: recordings in, bags with segments out."""
+
+import json
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import numpy as np
+import typer
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from line_feature_node.bag import NO_IMAGES, Outcome, Run, TargetError, process_recording
+from line_feature_node.cli_options import console, errors, fail
+from line_feature_node.core import Parameters
+from line_feature_node.files import read_mask
+from line_feature_node.recordings import RecordingError, find_recordings
+from line_feature_node.slices import OUTPUTS, Frame, Job
+from line_feature_node.workers import Workers, WorkersError, cluster, local
+
+#: Status of a process that SIGINT or SIGTERM ended, as shells have it.
+INTERRUPTED = {signal.SIGINT: 130, signal.SIGTERM: 143}
+
+
+class _Interrupted(BaseException):
+    """A signal asked for the end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = signal.Signals(number)
+
+
+def bag(
+    recordings: Annotated[list[Path], typer.Argument(
+        metavar='IN', readable=False, help='Recordings (.bag, .mcap, .db3, folders of ROS 2), or folders of them.')],
+    parameters: Parameters,
+    out: Annotated[Path, typer.Option(help='The new bag; of several recordings, the folder for theirs.')],
+    topic: Annotated[Optional[list[str]], typer.Option(help='Topic of images; all of them unless given.')] = None,
+    start: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to start at.')] = None,
+    end: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to end at.')] = None,
+    every: Annotated[int, typer.Option(min=1, help='Process one of so many frames of each topic.')] = 1,
+    storage: Annotated[str, typer.Option(help='Format of the new bag: mcap or sqlite3.')] = 'mcap',
+    copy: Annotated[bool, typer.Option('--copy', help='Copy everything of the input, too.')] = False,
+    csv: Annotated[bool, typer.Option('--csv', help='Write segments.csv into the new bag, one row a segment.')] = False,
+    only_segments: Annotated[bool, typer.Option('--only-segments', help='Neither markers nor overlays.')] = False,
+    mask_file: Annotated[Optional[Path], typer.Option(help='Image file, black where no edges are wanted.')] = None,
+    truth: Annotated[bool, typer.Option('--truth', help='Compare with true segments on TOPIC/truth.')] = False,
+    workers: Annotated[Optional[int], typer.Option(min=1, help='Processes; as many as processors.')] = None,
+    scheduler: Annotated[Optional[str], typer.Option(help='Dask scheduler instead, tcp://host:port.')] = None,
+    resume: Annotated[bool, typer.Option('--resume', help='Go on from what an interrupted run left.')] = False,
+    overwrite: Annotated[bool, typer.Option('--overwrite', help='Replace what is there.')] = False,
+    quiet: Annotated[bool, typer.Option('--quiet', help='Only errors are printed.')] = False,
+    as_json: Annotated[bool, typer.Option('--json', help='Print one line of JSON at the end.')] = False,
+) -> None:
+    """Extract the segments of recordings into new bags: segments, markers and overlays beside the stamps of the images.
+
+    Ends with status 0 when all went well, 1 when some frames or recordings failed, and 2 when nothing could be read.
+    """
+    if storage not in ('mcap', 'sqlite3'):
+        raise typer.BadParameter(f'storage must be mcap or sqlite3, got {storage!r}')
+    try:
+        mask = read_mask(mask_file) if mask_file else None
+        sources = find_recordings(recordings)
+        crew = cluster(scheduler) if scheduler else local(workers)
+    except (RecordingError, WorkersError, ValueError) as error:
+        fail(str(error))
+    job = Job(parameters, mask, outputs=('segments',) if only_segments else tuple(OUTPUTS), truth=truth, csv=csv)
+    run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)
+    outcomes = []
+    try:
+        with _interruptible():
+            for source, target in _targets(sources, out):
+                outcomes.append(_process(source, target, run, crew, quiet=quiet or as_json))
+    except _Interrupted as error:
+        errors.print(f'{error.number.name}: ended before all was done; --resume goes on from there', markup=False)
+        raise typer.Exit(INTERRUPTED[error.number]) from None
+    if as_json:
+        print(json.dumps({'recordings': [_summary(outcome) for outcome in outcomes]}))
+    elif not quiet:
+        for outcome in outcomes:
+            if outcome.frames:
+                console.print(_table(outcome))
+    raise typer.Exit(_status(outcomes))
+
+
+def _targets(sources: list[Path], out: Path) -> Iterator[tuple[Path, Path]]:
+    """Each recording with its bag; names that come twice are numbered."""
+    if len(sources) == 1:
+        yield sources[0], out
+        return
+    taken: Counter[str] = Counter()
+    for source in sources:
+        name = source.name if source.is_dir() else source.stem
+        taken[name] += 1
+        yield source, out / (name if taken[name] == 1 else f'{name}-{taken[name]}')
+
+
+def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool) -> Outcome:
+    """Process a recording with a progress bar; what goes wrong with all of it is a line on standard error."""
+    try:
+        with _progress(source.name, quiet=quiet) as watch:
+            outcome = process_recording(source, target, run, crew, watch)
+    except (RecordingError, TargetError, WorkersError) as error:
+        outcome = Outcome(source, target, error=str(error))
+    if outcome.error:
+        errors.print(outcome.error if outcome.frames or str(source) in outcome.error else f'{source}: {outcome.error}',
+                     markup=False)
+    for reason, count in outcome.failed.most_common():
+        errors.print(f'{source}: {count} frames failed: {reason}', markup=False)
+    if outcome.uncopied:
+        errors.print(f'{source}: not copied, for want of their types: {", ".join(outcome.uncopied)}', markup=False)
+    return outcome
+
+
+@contextmanager
+def _progress(name: str, *, quiet: bool) -> Iterator[Any]:
+    """A bar with frames a second, time left and segments, on a terminal."""
+    columns = (TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
+               TextColumn('{task.fields[frames]} frames, {task.fields[rate]}/s, {task.fields[segments]} segments'))
+    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as progress:
+        task = progress.add_task(name, total=None, frames=0, rate=0, segments=0)
+        frames, segments = 0, 0
+
+        def watch(done: int, slices: int, frame: Frame | None) -> None:
+            nonlocal frames, segments
+            if frame is not None:
+                frames, segments = frames + 1, segments + frame.segments
+                return
+            elapsed = progress.tasks[0].elapsed or 1.0
+            progress.update(task, completed=done, total=slices, frames=frames, segments=segments,
+                            rate=round(frames / elapsed))
+
+        yield watch
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Signals end what is under way as an exception does, so that it is cleared up."""
+
+    def interrupt(number: int, _: Any) -> None:
+        raise _Interrupted(number)
+
+    before = {number: signal.signal(number, interrupt) for number in INTERRUPTED}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _status(outcomes: list[Outcome]) -> int:
+    """Nothing could be read: 2; something failed: 1; a recording without images is none that failed."""
+    unread = [outcome for outcome in outcomes if outcome.error and not _empty(outcome)]
+    if len(unread) == len(outcomes):
+        return 2
+    processed = [frame for outcome in outcomes for frame in outcome.frames]
+    if processed and all(frame.error for frame in processed):
+        return 2
+    return 1 if unread or any(frame.error for frame in processed) else 0
+
+
+def _empty(outcome: Outcome) -> bool:
+    return outcome.error == NO_IMAGES
+
+
+def _summary(outcome: Outcome) -> dict[str, Any]:
+    """What became of a recording, in plain types."""
+    summary: dict[str, Any] = {
+        'source': str(outcome.source), 'target': str(outcome.target), 'error': outcome.error,
+        'frames': len(outcome.frames), 'failed': dict(outcome.failed), 'segments': outcome.segments,
+    }
+    agreements = [frame.agreement for frame in outcome.frames if frame.agreement]
+    if agreements:
+        precision, recall, angle, offset = np.nanmedian(agreements, axis=0).tolist()
+        summary['truth'] = {'frames': len(agreements), 'precision': precision, 'recall': recall,
+                            'angle_degrees': float(np.degrees(angle)), 'offset_pixels': offset}
+    return summary
+
+
+def _table(outcome: Outcome) -> Table:
+    """What became of a recording, for people."""
+    table = Table(str(outcome.source), '')
+    table.columns[1].justify = 'right'
+    good = [frame for frame in outcome.frames if not frame.error]
+    table.add_row('frames', str(len(outcome.frames)))
+    table.add_row('of them failed', str(len(outcome.frames) - len(good)))
+    table.add_row('segments', str(outcome.segments))
+    if good:
+        table.add_row('extraction of a frame (median)', f'{np.median([frame.seconds for frame in good]) * 1e3:.2f} ms')
+    agreement = _summary(outcome).get('truth')
+    if agreement:
+        table.add_row('against the truth (medians)',
+                      f'precision {agreement["precision"]:.2f}, recall {agreement["recall"]:.2f}, '
+                      f'{agreement["angle_degrees"]:.2f} degrees, {agreement["offset_pixels"]:.2f} px')
+    if good:
+        table.add_row('written to', str(outcome.target))
+    return table

@@ -1,0 +1,66 @@
+"""What the commands of `line_features` share: options for all parameters, and how they speak."""
+
+import inspect
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn, Optional
+
+import typer
+from rich.console import Console
+
+from line_feature_node.core import PROFILES, Parameters
+from line_feature_node.parameter_files import read_parameter_file
+
+console, errors = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def fail(message: str) -> NoReturn:
+    """End with one sentence and status 2."""
+    errors.print(message, markup=False)
+    raise typer.Exit(2)
+
+
+def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command, which takes `parameters`, options for a file, for `profile` and for each of Parameters instead.
+
+    What is given as an option wins over what the file says, and that over the profile.
+    """
+
+    def run(params_file: Path | None, profile: str | None, **values: Any) -> None:
+        own = {name: values.pop(name) for name in kept}
+        given = {name: value for name, value in values.items() if value is not None}
+        try:
+            parameters = _parameters(params_file, profile, given)
+        except (TypeError, ValueError) as error:
+            raise typer.BadParameter(str(error)) from None
+        command(**own, parameters=parameters)
+
+    signature = inspect.signature(command)
+    kept = [name for name in signature.parameters if name != 'parameters']
+    options: dict[str, tuple[Any, str]] = {
+        'params-file': (Path, 'Parameter file (YAML) of a ROS 2 node, whose values are taken.'),
+        'profile': (str, f'Set of parameters to start from: {", ".join(PROFILES)}; default default.')}
+    for name, spec in Parameters.specs().items():
+        unit = f' ({spec.unit})' if spec.unit else ''
+        default = getattr(Parameters(), name)
+        kind = types.GenericAlias(tuple, (float,) * len(default)) if isinstance(default, tuple) else type(default)
+        options[name] = (kind, f'{spec.description} {spec.range}{unit}; default {default}.')
+    added = [
+        inspect.Parameter(name.replace('-', '_'), inspect.Parameter.KEYWORD_ONLY,
+                          default=typer.Option(None, f'--{name}', help=text), annotation=Optional[kind])
+        for name, (kind, text) in options.items()]
+    described = [*(signature.parameters[name] for name in kept), *added]
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    # What Typer reads of a function, instead of what the function has.
+    vars(run)['__signature__'] = signature.replace(parameters=described)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in described}
+    return run
+
+
+def _parameters(path: Path | None, profile: str | None, given: dict[str, Any]) -> Parameters:
+    values, unknown = read_parameter_file(path) if path else ({}, [])
+    for name in unknown:
+        errors.print(f'{path}: there is no parameter {name!r}, what it is set to has no effect', markup=False)
+    own = {name: value for name, value in values.items() if name in Parameters.specs()}
+    return Parameters.profile(profile or values.get('profile', 'default'), **{**own, **given})

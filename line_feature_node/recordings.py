@@ -1,0 +1,197 @@
+"""Recordings of ROS 1 and ROS 2 as they lie on disk: found, opened, and divided into slices of time."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.typesys import Stores, get_typestore
+
+from line_feature_node.images import compressed_image_of, image_of
+
+#: How the picture of a message is had, by its type.
+DECODERS = {'sensor_msgs/msg/Image': image_of, 'sensor_msgs/msg/CompressedImage': compressed_image_of}
+#: Files that are recordings, or parts of one.
+SUFFIXES = ('.bag', '.db3', '.mcap')
+METADATA = 'metadata.yaml'
+#: Frames in a slice, about: few enough to be kept in memory, enough to be worth opening the recording for.
+SLICE = 32
+
+Reader = Reader1 | Reader2
+
+
+class RecordingError(ValueError):
+    """A recording cannot be read; the message is a sentence for users."""
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The images of a recording in a span of time: what one worker does at a time.
+
+    Attributes:
+        path: The recording.
+        topics: Topics of images.
+        start, stop: Nanoseconds, the first that belongs to it and the first that no longer does.
+        every: One of so many frames of a topic is processed.
+        skipped: Frames of each topic that came before it, to count on from.
+    """
+
+    path: Path
+    topics: tuple[str, ...]
+    start: int
+    stop: int
+    every: int = 1
+    skipped: tuple[int, ...] = ()
+
+
+def find_recordings(paths: list[Path]) -> list[Path]:
+    """The recordings themselves, and of folders that are none those inside, at any depth.
+
+    Raises:
+        RecordingError: There is nothing of that name, or no recording in a folder.
+    """
+    found: list[Path] = []
+    for path in paths:
+        try:
+            path.stat()
+            inside = list(_inside(path, set()))
+        except FileNotFoundError:
+            raise RecordingError(f'{path}: no such file or folder') from None
+        except OSError as error:
+            raise RecordingError(f'{error.filename or path}: {error.strerror}') from None
+        if not inside:
+            raise RecordingError(f'{path}: no recordings ({", ".join(SUFFIXES)}) in this folder')
+        found += inside
+    return found
+
+
+def _inside(path: Path, seen: set[Path]) -> Iterator[Path]:
+    """The recordings in a folder that is in none of those seen, as links may lead back to them."""
+    if not path.is_dir() or (path / METADATA).exists():
+        yield path
+        return
+    place = path.resolve()
+    if place in seen:
+        return
+    seen.add(place)
+    for entry in sorted(path.iterdir()):
+        if entry.is_dir() or entry.suffix in SUFFIXES:
+            yield from _inside(entry, seen)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Reader]:
+    """A recording, open for reading while the block lasts.
+
+    Only the types of images are needed from it, which are known: definitions that it lacks or has wrong do not matter.
+
+    Raises:
+        RecordingError: It cannot be read, or what is read of it in the block makes no sense.
+    """
+    if path.is_file() and path.stat().st_size == 0:
+        raise RecordingError(f'{path}: the file is empty')
+    if path.is_file() and path.suffix not in SUFFIXES:
+        raise RecordingError(f'{path}: not a recording, expected one of {", ".join(SUFFIXES)} or a folder')
+    try:
+        with (Reader1(path) if is_ros1(path) else Reader2(path)) as reader:
+            yield reader
+    except (RecordingError, GeneratorExit):
+        raise
+    except OSError as error:
+        raise RecordingError(f'{path}: {error.strerror or error}') from error
+    except Exception as error:
+        # Whatever the library makes of bytes that are noise: its own errors, and those of what it is built on.
+        raise RecordingError(f'{path}: cannot be read ({_reason(error)})') from error
+
+
+def _reason(error: Exception) -> str:
+    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
+
+
+def is_ros1(path: Path) -> bool:
+    """Whether a recording is one of ROS 1; a folder is one of ROS 2, whatever its name."""
+    return path.suffix == '.bag' and not path.is_dir()
+
+
+def image_topics(reader: Reader) -> dict[str, str]:
+    """Topics that have images, with their message types."""
+    return {connection.topic: connection.msgtype for connection in reader.connections
+            if connection.msgtype in DECODERS}
+
+
+@cache
+def typestore(*, ros1: bool) -> Any:
+    """The types of messages as ROS 1 or ROS 2 has them."""
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+
+
+def deserialize(path: Path, data: bytes, msgtype: str) -> Any:
+    """A message from the bytes that a recording has.
+
+    Raises:
+        ValueError: They are none.
+    """
+    try:
+        if is_ros1(path):
+            return typestore(ros1=True).deserialize_ros1(data, msgtype)
+        return typestore(ros1=False).deserialize_cdr(data, msgtype)
+    except Exception as error:
+        # The code that the library generates for a type reads on, and fails in as many ways as bytes can be wrong.
+        raise ValueError(f'{len(data)} bytes that are no {msgtype}: {_reason(error)}') from error
+
+
+def plan(
+    path: Path, *, topics: list[str], start: float | None = None, end: float | None = None, every: int = 1,
+) -> list[Slice]:
+    """Divide the images of a recording into slices of about SLICE frames; the same ones each time.
+
+    Args:
+        path: The recording.
+        topics: Topics to be processed; empty for all that have images.
+        start, end: Seconds from the beginning of the recording.
+        every: One of so many frames of a topic is to be processed.
+
+    Returns:
+        Slices in the order of time; none where there are no images.
+
+    Raises:
+        RecordingError: The recording cannot be read, or lacks a topic.
+    """
+    with opened(path) as reader:
+        known = image_topics(reader)
+        for topic in topics:
+            if topic not in known:
+                raise RecordingError(f'{path}: no images on {topic!r}, but on {", ".join(sorted(known)) or "no topic"}')
+        chosen = tuple(dict.fromkeys(topics or sorted(known)))
+        connections = [connection for connection in reader.connections if connection.topic in chosen]
+        count = sum(connection.msgcount for connection in connections)
+        if not connections or not count:
+            return []
+        begin = reader.start_time + round((start or 0) * 1e9)
+        stop = reader.end_time if end is None else min(reader.end_time, reader.start_time + round(end * 1e9))
+        if begin >= stop:
+            return []
+        share = (stop - begin) / max(reader.end_time - reader.start_time, 1)
+        number = max(1, math.ceil(count * share / SLICE))
+        edges = [begin + (stop - begin) * k // number for k in range(number + 1)]
+        slices = [Slice(path, chosen, first, last, every) for first, last in pairwise(edges)]
+        return _counted(reader, slices) if every > 1 else slices
+
+
+def _counted(reader: Reader, slices: list[Slice]) -> list[Slice]:
+    """Slices that know how many frames came before them; that is read from the recording."""
+    topics = slices[0].topics
+    seen = dict.fromkeys(topics, 0)
+    counted = []
+    connections = [connection for connection in reader.connections if connection.topic in topics]
+    for part in slices:
+        counted.append(Slice(part.path, topics, part.start, part.stop, part.every, tuple(seen.values())))
+        for connection, _, _ in reader.messages(connections, part.start, part.stop):
+            seen[connection.topic] += 1
+    return counted

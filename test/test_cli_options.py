@@ -1,0 +1,55 @@
+import inspect
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from line_feature_node.cli_options import with_parameters
+from line_feature_node.core import Parameters
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run a command that keeps its parameters."""
+    kept = []
+
+    def command(name: str, parameters: Parameters) -> None:
+        kept.append((name, parameters))
+
+    app = typer.Typer()
+    app.command()(with_parameters(command))
+
+    def run(*arguments):
+        result = CliRunner().invoke(app, ['some', *map(str, arguments)])
+        return result, kept[-1][1] if kept else None
+
+    return run
+
+
+def test_every_parameter_is_an_option():
+    names = set(inspect.signature(with_parameters(lambda parameters: print(parameters))).parameters)
+    assert names == {'params_file', 'profile', *Parameters.specs()}
+
+
+def test_without_options_there_are_the_defaults(run):
+    assert run()[1] == Parameters()
+
+
+def test_options_win_over_the_file_and_that_over_the_profile(run, tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/**: {ros__parameters: {profile: corridor, T1: 30, T2: 7.0, nonsense: 1}}')
+    result, parameters = run('--params-file', path, '--T2', 6)
+    assert parameters == Parameters.profile('corridor', T1=30.0, T2=6.0)
+    assert "no parameter 'nonsense'" in result.stderr
+
+
+def test_a_list_takes_its_numbers_one_by_one(run):
+    assert run('--roi', 0, 0.5, 1, 0.5)[1].roi == (0.0, 0.5, 1.0, 0.5)
+
+
+@pytest.mark.parametrize('arguments', [('--T1', 2), ('--profile', 'none'), ('--params-file', 'missing.yaml')])
+def test_what_cannot_be_is_a_sentence_and_status_2(run, arguments):
+    result, parameters = run(*arguments)
+    assert result.exit_code == 2
+    assert parameters is None
+    assert 'Traceback' not in result.output

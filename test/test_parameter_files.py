@@ -1,0 +1,40 @@
+from pathlib import Path
+
+import pytest
+
+from line_feature_node.core import Parameters
+from line_feature_node.parameter_files import read_parameter_file
+
+CONFIG = Path(__file__).resolve().parents[1] / 'config'
+
+
+@pytest.mark.parametrize('name', ['default', 'corridor', 'lane_tracking', 'paper'])
+def test_files_of_the_node_are_accepted_as_they_are(name):
+    values, unknown = read_parameter_file(CONFIG / f'{name}.yaml')
+    assert values['profile'] == name
+    assert unknown == []
+    own = {key: value for key, value in values.items() if key in Parameters.specs()}
+    assert Parameters.of(own) == Parameters.profile(name)
+
+
+def test_sections_of_nodes_and_namespaces_are_found_and_unknown_names_told(tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/front:\n  some_node:\n    ros__parameters: {T1: 50, use_sim_time: true}\n')
+    assert read_parameter_file(path) == ({'T1': 50}, ['use_sim_time'])
+
+
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('T1: 5', 'no ros__parameters'), ('', 'no ros__parameters'), ('[1, 2]', 'no ros__parameters'),
+    ('a: {ros__parameters: 5}', 'must be names with values, got 5'), ('a: [', 'not YAML'), ('\xff\x00', 'not YAML')])
+def test_what_is_no_parameter_file_is_a_sentence(tmp_path, text, reason):
+    path = tmp_path / 'some.yaml'
+    path.write_bytes(text.encode('latin-1'))
+    with pytest.raises(ValueError, match=reason) as caught:
+        read_parameter_file(path)
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_a_missing_file_is_a_sentence(tmp_path):
+    with pytest.raises(ValueError, match='none.yaml: No such file'):
+        read_parameter_file(tmp_path / 'none.yaml')

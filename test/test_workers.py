@@ -1,0 +1,295 @@
+"""Workers that are processes of this machine, or of a Dask cluster, and what becomes of the work when they die."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from line_feature_node import workers as workers_module
+from line_feature_node.workers import ATTEMPTS, Workers, WorkersError, cluster, in_order, inline, local
+
+#: Seconds after which something that a test waits for will not come any more.
+DEADLINE = 30.0
+HERE = Path(__file__).parent
+#: For other processes, which find what this one finds.
+ENVIRONMENT = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(HERE), *filter(None, sys.path)])}
+
+
+def until(condition, what, deadline=DEADLINE):
+    end = time.monotonic() + deadline
+    while not condition():
+        assert time.monotonic() < end, f'{what}: waited {deadline:g} s for it'
+        time.sleep(0.01)
+
+
+# Work, which other processes find by its name
+
+def double(number):
+    return str(2 * number).encode()
+
+
+def slow_first(number):
+    time.sleep(0.2 if number == 0 else 0)
+    return double(number)
+
+
+def fail(number):
+    if number == 3:
+        raise KeyError('the work itself')
+    return double(number)
+
+
+def mark(number, folder):
+    """Leave a file of one's own for each time the work is done."""
+    done = len(list(folder.glob(f'{number}-*')))
+    (folder / f'{number}-{done}-{os.getpid()}').touch()
+    return done
+
+
+def die_once(number, folder):
+    """The second piece of work kills who does it, the first time."""
+    if mark(number, folder) == 0 and number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return double(number)
+
+
+def die_always(number, folder):
+    mark(number, folder)
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return double(number)
+
+
+def sleep(number, folder):
+    mark(number, folder)
+    time.sleep(60)
+    return double(number)
+
+
+def who(number):
+    return str(os.getpid()).encode()
+
+
+def ignores_interrupts(number):
+    os.kill(os.getpid(), signal.SIGINT)
+    return double(number)
+
+
+def times(folder):
+    """How often each piece of work was begun."""
+    return Counter(int(path.name.split('-')[0]) for path in folder.iterdir())
+
+
+def processes(folder):
+    return {int(path.name.split('-')[2]) for path in folder.iterdir()}
+
+
+def alive(pid):
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] not in 'ZX'
+    except OSError:
+        return False
+
+
+def pieces(count, *more):
+    return [(number, *more) for number in range(count)]
+
+
+def doubles(count):
+    return [double(number) for number in range(count)]
+
+
+def threads(count):
+    return Workers(count, lambda: ThreadPoolExecutor(count))
+
+
+# Order, and how much is under way
+
+@pytest.mark.parametrize('crew', [inline(), threads(3)], ids=['inline', 'threads'])
+@pytest.mark.parametrize('count', [0, 1, 2, 50])
+def test_results_come_in_the_order_of_the_pieces(crew, count):
+    assert list(in_order(crew, slow_first, pieces(count))) == doubles(count)
+
+
+def test_pieces_may_be_any_iterable_and_have_any_number_of_arguments():
+    assert list(in_order(inline(), lambda *numbers: bytes(numbers), iter([(), (1,), (1, 2)]))) == [b'', b'\1', b'\1\2']
+
+
+def test_only_so_many_are_under_way_as_keep_the_workers_busy():
+    begun = []
+
+    def work(number):
+        begun.append(number)
+        return b''
+
+    for count in (1, 3):
+        begun.clear()
+        for done, _ in enumerate(in_order(threads(count), work, pieces(40)), 1):
+            time.sleep(0.001)
+            assert len(begun) <= done + 2 * count
+        assert sorted(begun) == list(range(40))
+
+
+def test_workers_are_all_busy_at_a_time():
+    together = threading.Barrier(3, timeout=DEADLINE)
+
+    def work(number):
+        together.wait()
+        return double(number)
+
+    assert list(in_order(threads(3), work, pieces(6))) == doubles(6)
+
+
+def test_an_exception_of_the_work_passes_through_after_the_results_before_it():
+    results = in_order(threads(2), fail, pieces(9))
+    assert [next(results) for _ in range(3)] == doubles(3)
+    with pytest.raises(KeyError, match='the work itself'):
+        next(results)
+
+
+def test_who_stops_early_does_not_have_the_rest_done():
+    begun = []
+
+    def work(number):
+        begun.append(number)
+        return b''
+
+    results = in_order(inline(), work, pieces(100))
+    next(results)
+    results.close()
+    assert len(begun) <= 4
+    assert threading.active_count() < 10
+
+
+def test_inline_is_this_process():
+    assert list(in_order(inline(), who, pieces(3))) == [str(os.getpid()).encode()] * 3
+    assert inline().count == 1
+
+
+def test_there_are_as_many_workers_as_processors_unless_a_number_is_given():
+    assert local().count == len(os.sched_getaffinity(0))
+    assert local(7).count == 7
+
+
+# Processes
+
+def test_processes_do_the_work_in_order_and_leave_interrupts_to_their_parent():
+    assert list(in_order(local(2), ignores_interrupts, pieces(9))) == doubles(9)
+    [pid] = set(in_order(local(1), who, pieces(4)))
+    assert int(pid) != os.getpid()
+    until(lambda: not alive(int(pid)), 'end of the worker')
+
+
+def test_an_exception_in_another_process_passes_through():
+    with pytest.raises(KeyError, match='the work itself'):
+        list(in_order(local(1), fail, pieces(9)))
+
+
+def test_the_work_of_a_killed_worker_is_done_again(tmp_path):
+    assert list(in_order(local(2), die_once, pieces(12, tmp_path))) == doubles(12)
+    done = times(tmp_path)
+    assert set(done) == set(range(12))
+    assert done[1] >= 2
+    assert max(done.values()) <= 3
+
+
+def test_a_worker_that_is_killed_from_outside_costs_only_what_was_under_way(tmp_path):
+    results = in_order(local(1), mark_and_double, pieces(30, tmp_path))
+    found = [next(results) for _ in range(10)]
+    [pid] = processes(tmp_path)
+    os.kill(pid, signal.SIGKILL)
+    found += results
+    assert found == doubles(30)
+    assert max(times(tmp_path).values()) <= 2
+    assert all(count == 1 for number, count in times(tmp_path).items() if number < 10)
+
+
+def mark_and_double(number, folder):
+    mark(number, folder)
+    time.sleep(0.005)
+    return double(number)
+
+
+def test_workers_that_die_each_time_are_an_error(tmp_path):
+    results = in_order(local(1), die_always, pieces(5, tmp_path))
+    assert [next(results) for _ in range(2)] == doubles(2)
+    with pytest.raises(WorkersError, match=f'killed {ATTEMPTS} times in a row') as error:
+        next(results)
+    assert ATTEMPTS <= times(tmp_path)[2] <= ATTEMPTS + 1
+    assert '\n' not in str(error.value)
+
+
+def test_attempts_are_counted_anew_when_something_was_done():
+    left = list(range(10))
+
+    class Dying(ThreadPoolExecutor):
+        """Does one piece of work and breaks."""
+
+        def submit(self, work, *arguments):
+            future = super().submit(work, *arguments)
+            if arguments[0] != left[0]:
+                future = super().submit(broken)
+            return future
+
+    def broken():
+        raise workers_module.BrokenExecutor
+
+    found = []
+    for result in in_order(Workers(1, lambda: Dying(1)), double, pieces(10)):
+        found.append(result)
+        left.pop(0)
+    assert found == doubles(10)
+
+
+def run(folder, code):
+    """Another Python that has this module."""
+    script = folder / 'parent.py'
+    script.write_text(f'import sys\nsys.path.insert(0, {str(HERE)!r})\nfrom test_workers import *\n'
+                      f'folder = Path({str(folder / "marks")!r})\nif __name__ == "__main__":\n    {code}\n')
+    (folder / 'marks').mkdir()
+    return subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                            env=ENVIRONMENT)
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    parent = run(tmp_path, 'list(in_order(local(2), sleep, pieces(8, folder)))')
+    try:
+        until(lambda: len(processes(tmp_path / 'marks')) == 2 or parent.poll() is not None, 'two workers')
+        children = processes(tmp_path / 'marks')
+        assert parent.pid not in children
+        assert all(map(alive, children))
+    finally:
+        parent.kill()
+        parent.communicate(timeout=DEADLINE)
+    until(lambda: not any(map(alive, children)), 'end of the workers', 5)
+    before = times(tmp_path / 'marks')
+    time.sleep(0.2)
+    assert times(tmp_path / 'marks') == before
+
+
+def test_a_signal_to_the_parent_leaves_no_workers(tmp_path):
+    """As from a terminal, where an interrupt goes to all of them."""
+    parent = run(tmp_path, 'list(in_order(local(2), mark_and_double, pieces(5000, folder)))')
+    until(lambda: len(processes(tmp_path / 'marks')) == 2 or parent.poll() is not None, 'two workers')
+    children = processes(tmp_path / 'marks')
+    parent.send_signal(signal.SIGINT)
+    for child in children:
+        os.kill(child, signal.SIGINT)
+    _, errors = parent.communicate(timeout=DEADLINE)
+    assert errors.count('Traceback') == 1  # that of the parent, which does nothing about it
+    until(lambda: not any(map(alive, children)), 'end of the workers', 5)
+
+
+# Dask
+
+def test_without_dask_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    with pytest.raises(WorkersError, match='fleet'):
+        cluster('tcp://127.0.0.1:8786')
