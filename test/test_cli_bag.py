@@ -63,8 +63,8 @@ def test_a_topic_that_is_not_there_is_told_with_those_that_are(tmp_path):
 @pytest.mark.parametrize(('number', 'status'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signals_leave_no_target(tmp_path, number, status):
     code = 'from line_feature_node.cli import main; main()'
-    process = subprocess.Popen(
-        [sys.executable, '-c', code, 'bag', str(BAGS), '--out', str(tmp_path / 'out')], stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, '-c', code, 'bag', str(BAGS), '--out', str(tmp_path / 'out')]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     end = time.monotonic() + 60
     while not list(tmp_path.glob('out/*.partial')) and time.monotonic() < end:
         time.sleep(0.01)

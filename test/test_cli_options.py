@@ -27,7 +27,10 @@ def run(tmp_path):
 
 
 def test_every_parameter_is_an_option():
-    names = set(inspect.signature(with_parameters(lambda parameters: print(parameters))).parameters)
+    def command(parameters: Parameters) -> None:
+        raise AssertionError(parameters)
+
+    names = set(inspect.signature(with_parameters(command)).parameters)
     assert names == {'params_file', 'profile', *Parameters.specs()}
 
 
