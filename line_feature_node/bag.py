@@ -122,6 +122,9 @@ def process_recording(
         TargetError: The target exists, or cannot be written.
         WorkersError: The workers die.
     """
+    here, there = source.resolve(), target.resolve()
+    if here == there or here in there.parents or there in here.parents:
+        raise TargetError(f'{target} is the recording itself, or one of the two is in the other')
     if target.exists() and not run.overwrite:
         raise TargetError(f'{target} exists: --overwrite replaces it')
     slices = plan(source, topics=list(run.topics), start=run.start, end=run.end, every=run.every)
