@@ -122,7 +122,7 @@ def compare(
         files.write_picture(target, sheet(panels, columns=2))
     except OSError as error:
         fail(f'{error.filename}: {error.strerror}' if error.filename == str(path)
-              else f'cannot write to {out}: {error.strerror}')
+             else f'cannot write to {out}: {error.strerror}')
     except (TypeError, ValueError) as error:
         fail(str(error) if path is None else f'{path}: {error}')
     if path is None:
@@ -221,8 +221,8 @@ def _demo_of_a_picture(parameters: Parameters, out: Path) -> None:
     agreement = truth.compare(end_points(outcome.segments), scene.truth, scene.weak)
     if agreement.recall > 0:
         console.print(f'against the ground truth: precision {agreement.precision:.2f}, recall {agreement.recall:.2f}, '
-                       f'orientation within {np.degrees(agreement.angle):.2f} degrees and position within '
-                       f'{agreement.offset:.2f} px (medians)')
+                      f'orientation within {np.degrees(agreement.angle):.2f} degrees and position within '
+                      f'{agreement.offset:.2f} px (medians)')
     else:
         console.print('against the ground truth: nothing of it was found')
     console.print(f'table:   {outcome.table}\noverlay: {outcome.overlay}', markup=False)
