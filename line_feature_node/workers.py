@@ -141,6 +141,6 @@ def _results(
     while under_way:
         result = under_way.popleft().result()
         remaining.popleft()
+        yield result  # before anything that fails when workers died, or it would be lost
         if len(remaining) > len(under_way):
             under_way.append(executor.submit(work, *remaining[len(under_way)]))
-        yield result
