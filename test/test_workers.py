@@ -274,19 +274,6 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
     assert times(tmp_path / 'marks') == before
 
 
-def test_a_signal_to_the_parent_leaves_no_workers(tmp_path):
-    """As from a terminal, where an interrupt goes to all of them."""
-    parent = run(tmp_path, 'list(in_order(local(2), mark_and_double, pieces(5000, folder)))')
-    until(lambda: len(processes(tmp_path / 'marks')) == 2 or parent.poll() is not None, 'two workers')
-    children = processes(tmp_path / 'marks')
-    parent.send_signal(signal.SIGINT)
-    for child in children:
-        os.kill(child, signal.SIGINT)
-    _, errors = parent.communicate(timeout=DEADLINE)
-    assert errors.count('Traceback') == 1  # that of the parent, which does nothing about it
-    until(lambda: not any(map(alive, children)), 'end of the workers', 5)
-
-
 # Dask
 
 def test_without_dask_the_extra_is_named(monkeypatch):
