@@ -410,7 +410,7 @@ def soak(folder: Path, options: argparse.Namespace) -> list[Row]:
 def draw(samples: list[Row], path: Path) -> None:
     """Memory and latency over time; where matplotlib is missing, say so."""
     try:
-        from matplotlib.figure import Figure  # noqa: PLC0415
+        from matplotlib.figure import Figure
     except ImportError:
         print(f'the curve is not drawn, as matplotlib is not installed: where it is, --draw {path.parent} draws it')
         return

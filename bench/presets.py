@@ -286,7 +286,7 @@ def photographs(preset: str, paths: list[Path], folder: Path | None, reps: int) 
     return table(['picture', 'parameters', 'segments', 'px in all', 'median px', 'ms'], lines)
 
 
-def judge_nothing(segments: Lines, frame: Frame) -> tuple[float, float, float]:  # noqa: ARG001
+def judge_nothing(_segments: Lines, _frame: Frame) -> tuple[float, float, float]:
     """The judge of frames without labels."""
     return (float('nan'),) * 3
 

@@ -19,7 +19,7 @@ def main() -> None:
         print(USAGE)
         return
     try:
-        from line_feature_node.node import run  # noqa: PLC0415
+        from line_feature_node.node import run
     except ImportError as error:
         sys.exit(f'the node needs ROS 2, which is not there ({error}): source its setup.bash, or install the packages '
                  f"of the extra 'ros' with pip")

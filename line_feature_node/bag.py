@@ -27,7 +27,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from line_feature_node.core import SEGMENT_DTYPE
 from line_feature_node.recordings import RecordingError, Slice, is_ros1, opened, plan, typestore
@@ -41,6 +41,8 @@ QOS = Qos(QosHistory.KEEP_LAST, 5, QosReliability.RELIABLE, QosDurability.VOLATI
 VERSION: Literal[9] = 9
 #: What is said of a recording without images, or without any in the time that was asked for.
 NO_IMAGES = 'no images to be processed'
+#: What definitions that are wrong or missing raise: the parser, the table of types, and their use.
+UNKNOWN_TYPES = (AssertionError, KeyError, TypesysError, ValueError)
 #: Overlays that are kept for the report.
 SAMPLES = 8
 
@@ -317,7 +319,7 @@ class _Copier:
             try:
                 self._targets[connection.id] = self._add(connection, writer)
                 self._sources.append(connection)
-            except Exception:  # noqa: BLE001, definitions that are wrong make errors of all kinds
+            except UNKNOWN_TYPES:
                 self.left_out.append(connection.topic)
 
     def _add(self, connection: Connection, writer: Writer) -> Connection:

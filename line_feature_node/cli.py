@@ -150,7 +150,7 @@ def demo(
     Without ROS 2 one picture of the corridor is processed, without a node.
     """
     try:
-        from line_feature_node.demo import play, render  # noqa: PLC0415
+        from line_feature_node.demo import play, render
     except ImportError as error:
         errors.print(f'ROS 2 is not there ({error}): one picture, without the node', markup=False)
         _demo_of_a_picture(parameters, out)

@@ -104,7 +104,7 @@ def play(scenes: list[Scene], arguments: list[str]) -> Outcome:
 def _process(arguments: list[str]) -> 'Iterator[subprocess.Popen[str]]':
     """The node as a process, which ends with the block."""
     command = [sys.executable, '-m', 'line_feature_node', '--ros-args', '--log-level', 'warn', *RELIABLE, *arguments]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)  # noqa: S603
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         yield process
     finally:
@@ -137,7 +137,7 @@ class _Player:
             self._wait_for(node)
             begin = time.monotonic()
             for number, scene in enumerate(self._scenes):
-                self._spin(lambda due=begin + number / RATE: time.monotonic() >= due, GRACE)  # type: ignore[misc]
+                self._wait_until(begin + number / RATE)
                 self._publish(number, scene)
             self._spin(lambda: not self._sent and self._outcome.health != '', GRACE)
             return self._outcome
@@ -151,6 +151,9 @@ class _Player:
             raise RuntimeError((node.stderr and node.stderr.read().strip()) or f'the node ended with {node.returncode}')
         if not self._images.get_subscription_count():
             raise RuntimeError(f'the node was not ready within {PATIENCE:.0f} s')
+
+    def _wait_until(self, due: float) -> None:
+        self._spin(lambda: time.monotonic() >= due, GRACE)
 
     def _spin(self, done: Callable[[], bool], patience: float) -> None:
         end = time.monotonic() + patience

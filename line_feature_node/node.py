@@ -426,7 +426,7 @@ def _spin_while_all_is_well(node: LineFeatureNode, executor: SingleThreadedExecu
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         node.context.try_shutdown()
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         if node.context.ok() and node.throttle.allows('callback'):
             node.get_logger().error(f'a callback failed: {error!r}')
 

@@ -79,8 +79,8 @@ def cluster(address: str) -> Workers:
         WorkersError: Dask is not installed, or nobody answers there.
     """
     try:
-        from distributed import Client, KilledWorker  # noqa: PLC0415
-        from distributed.comm import CommClosedError  # noqa: PLC0415
+        from distributed import Client, KilledWorker
+        from distributed.comm import CommClosedError
     except ImportError:
         raise WorkersError("Dask is not installed: install the extra 'fleet'") from None
     try:

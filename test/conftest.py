@@ -9,11 +9,23 @@ import os
 import sys
 import tempfile
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
+
+import pytest
 
 if 'COLCON' in os.environ:
     ROOT = Path(__file__).resolve().parents[1]
     sys.path[:] = [entry for entry in sys.path if Path(entry).resolve() != ROOT]
+
+#: They need ROS 2.
+ROS_TESTS = ['test_demo.py', 'test_node.py', 'test_node_parameters.py', 'test_node_process.py']
+collect_ignore = [] if find_spec('rclpy') else ROS_TESTS
+
+
+def pytest_report_header():
+    return f'ROS 2 is not there: {", ".join(collect_ignore)} are left out' if collect_ignore else ''
+
 
 FOLDER = Path(tempfile.gettempdir()) / f'line_feature_node-test-{os.getuid()}'
 FOLDER.mkdir(exist_ok=True)
@@ -35,3 +47,13 @@ def _domain():
 os.environ.update(
     ROS_DOMAIN_ID=str(_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOG_DIR=str(FOLDER / 'log'),
     RCUTILS_CONSOLE_OUTPUT_FORMAT='[{severity}] [{name}]: {message}')
+
+
+@pytest.fixture
+def bench(capfd):
+    """A context of ROS 2 of the test's own, with nodes to talk to the one under test."""
+    from test_node import Bench
+
+    bench = Bench(capfd)
+    yield bench
+    bench.close()

@@ -4,9 +4,8 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
+from line_feature_node import demo
 from line_feature_node.cli import app
-
-demo = pytest.importorskip('line_feature_node.demo', reason='ROS 2 is not there', exc_type=ImportError)
 
 
 def test_every_frame_of_the_drive_comes_back_with_what_is_true(tmp_path):

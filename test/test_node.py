@@ -1,7 +1,5 @@
 """The node in this process: its own context and executor for each test, no launch, no sleeping."""
 
-# flake8: noqa: E402
-
 import array
 import gc
 import re
@@ -11,9 +9,7 @@ import time
 import cv2
 import numpy as np
 import pytest
-
-rclpy = pytest.importorskip('rclpy')
-
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -219,13 +215,6 @@ class Bench:
 
 class Messages(list):
     subscription = None
-
-
-@pytest.fixture
-def bench(capfd):
-    bench = Bench(capfd)
-    yield bench
-    bench.close()
 
 
 @pytest.fixture

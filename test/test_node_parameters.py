@@ -1,17 +1,12 @@
 """The parameters of the node, as its start and its services have them."""
 
-# flake8: noqa: E402
-
 import math
 import re
 
 import pytest
-
-rclpy = pytest.importorskip('rclpy')
-
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter, parameter_value_to_python
-from test_node import NAME, Bench
+from test_node import NAME
 
 from line_feature_node.core import PROFILES, Parameters
 from line_feature_node.core.parameters import Spec
@@ -34,13 +29,6 @@ OTHERS = {
     'image_timeout': 3.5, 'max_latency': 0.5, 'max_dropped': 0.5,
 }
 RUNNING = [name for name, spec in TABLES.items() if not spec.constant]
-
-
-@pytest.fixture
-def bench(capfd):
-    bench = Bench(capfd)
-    yield bench
-    bench.close()
 
 
 @pytest.fixture

@@ -1,20 +1,15 @@
 """The node as a process of its own, as `ros2 run` starts it."""
 
-# flake8: noqa: E402
-
 import os
 import signal
 import subprocess
 import sys
 
 import pytest
-
-rclpy = pytest.importorskip('rclpy')
-
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
-from test_node import DEADLINE, Bench, expected, image, picture
+from test_node import DEADLINE, expected, image, picture
 
 from line_feature_node.messages import segments_of
 
@@ -39,13 +34,6 @@ class Process:
     def end(self, number=signal.SIGTERM):
         self.process.send_signal(number)
         return self.process.wait(DEADLINE)
-
-
-@pytest.fixture
-def bench(capfd):
-    bench = Bench(capfd)
-    yield bench
-    bench.close()
 
 
 @pytest.fixture
