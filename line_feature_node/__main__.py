@@ -1,5 +1,6 @@
 """Start the node as a process: `ros2 run`, `line_feature_node` and `python -m line_feature_node`."""
 
+import os
 import signal
 import sys
 from typing import Any
@@ -23,24 +24,25 @@ def main() -> None:
     except ImportError as error:
         sys.exit(f'the node needs ROS 2, which is not there ({error}): source its setup.bash, or install the packages '
                  f"of the extra 'ros' with pip")
-    sys.exit(run(sys.argv, stop))
+    sys.exit(run(sys.argv, stop.release))
 
 
 class _Stop:
-    """Ends the process at a signal, as importing and compiling take long; is true once there was one.
+    """Ends the process at a signal until the node can end by itself; importing and compiling take long.
 
-    That is for the case that what ends it is lost in some library that ignores all exceptions.
+    An exception would be lost in a callback of the compiler, which then fails in its own way, or goes on.
     """
 
     def __init__(self) -> None:
-        self._asked = False
-
-    def __bool__(self) -> bool:
-        return self._asked
+        self._wanted = True
 
     def __call__(self, _number: int, _frame: Any) -> None:
-        self._asked = True
-        raise SystemExit(0)
+        if self._wanted:
+            os._exit(0)
+
+    def release(self) -> None:
+        """Leave signals to the node from now on."""
+        self._wanted = False
 
 
 if __name__ == '__main__':

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,10 +19,11 @@ from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 
 from line_feature_node.core import end_points
+from line_feature_node.images import decode
 from line_feature_node.messages import segments_of
 from line_feature_node.node import MESSAGES
 from line_feature_node.scenes import Camera, Scene, corridor
@@ -128,7 +128,9 @@ class _Player:
         self._executor.add_node(self._node)
         self._images = self._node.create_publisher(Image, 'image', QoSProfile(depth=30))
         self._node.create_subscription(PointCloud2, 'line_feature_node/segments', self._on_segments, 5)
-        self._node.create_subscription(Image, 'line_feature_node/overlay', self._on_overlay, 5)
+        # Raw ones would fill the shared memory of the default transport, and make the segments late.
+        self._node.create_subscription(
+            CompressedImage, 'line_feature_node/overlay/compressed', self._on_overlay, 5)
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 5)
 
     def play(self, node: 'subprocess.Popen[str]') -> Outcome:
@@ -174,9 +176,8 @@ class _Player:
         scene = self._scenes[number]
         self._outcome.agreements.append(compare(end_points(segments), scene.truth, scene.weak))
 
-    def _on_overlay(self, message: Image) -> None:
-        picture: Any = np.ndarray((message.height, message.width, 3), np.uint8, bytes(message.data))
-        self._outcome.overlay = picture
+    def _on_overlay(self, message: CompressedImage) -> None:
+        self._outcome.overlay = np.asarray(decode(bytes(message.data)), np.uint8)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         if self._outcome.segments:

@@ -216,11 +216,17 @@ def known_pixels(image: NDArray[Any]) -> NDArray[np.bool_] | None:
 def usable_pixels(image: NDArray[Any], mask: NDArray[np.uint8] | None) -> NDArray[Any] | None:
     """A mask of the pixels that are finite and not masked; None where all are.
 
-    A mask of another shape is left for the extractor to refuse.
+    Raises:
+        ValueError: The mask has another shape.
     """
     known = known_pixels(image)
-    if known is None or mask is None or known.shape != mask.shape:
-        return known if mask is None else mask
+    if mask is None:
+        return known
+    if mask.shape != image.shape:
+        (height, width), (rows, columns) = image.shape, mask.shape
+        raise ValueError(f'an image of {width}×{height} pixels: mask_file has {columns}×{rows}')
+    if known is None:
+        return mask
     return np.asarray(known & (mask != 0))
 
 

@@ -5,6 +5,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,6 +62,18 @@ class Health:
     level: Level
     summary: str
     values: dict[str, str]
+
+
+class Publishers(NamedTuple):
+    """How many publishers the image topic has.
+
+    Attributes:
+        all: Those that are known of.
+        fitting: Those of them whose quality of service fits.
+    """
+
+    all: int
+    fitting: int
 
 
 @dataclass
@@ -134,12 +147,12 @@ class Monitor:
         if len(self.reasons) > WINDOW:  # of figures in them, from bytes that are noise
             self.reasons = Counter(dict(self.reasons.most_common(WINDOW // 2)))
 
-    def health(self, options: Options, *, publishers: int | None, waiting: str) -> Health:
+    def health(self, options: Options, *, publishers: Publishers | None, waiting: str) -> Health:
         """The verdict on the time since it was last asked for.
 
         Args:
             options: Its thresholds are used.
-            publishers: How many publishers the image topic has; None while it is not subscribed to.
+            publishers: Those of the image topic; None while it is not subscribed to.
             waiting: What the node waits for while it is not subscribed.
         """
         now, latest = self.clock(), self.counts
@@ -152,14 +165,12 @@ class Monitor:
         return Health(level, summary, self._values(since.processed / elapsed))
 
     def _verdict(
-        self, since: Counts, options: Options, publishers: int | None, waiting: str, silence: float,
+        self, since: Counts, options: Options, publishers: Publishers | None, waiting: str, silence: float,
     ) -> tuple[Level, str]:
         if publishers is None:
             return Level.OK, waiting
         if silence > options.image_timeout:
-            if publishers == 0:
-                return Level.ERROR, f'no image for {silence:.0f} s: the topic has no publisher'
-            return Level.ERROR, f'no image for {silence:.0f} s, though there is a publisher: see the log for its QoS'
+            return Level.ERROR, f'no image for {silence:.0f} s: {_reason_of_silence(publishers)}'
         if since.failed and not since.processed:
             return Level.ERROR, f'no image can be processed: {self.last_error}'
         if since.failed:
@@ -188,3 +199,11 @@ class Monitor:
             'last error': self.last_error,
             **{f'failed: {reason}': str(count) for reason, count in self.reasons.most_common(5)},
         }
+
+
+def _reason_of_silence(publishers: Publishers) -> str:
+    if not publishers.all:
+        return 'the topic has no publisher'
+    if not publishers.fitting:
+        return 'what its publishers offer does not fit, see the log for the quality of service'
+    return 'a publisher is there that sends nothing, or its images are lost on the way (docs/transport.md)'

@@ -5,7 +5,6 @@ import contextlib
 import ctypes
 import importlib
 import os
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -37,14 +36,12 @@ from line_feature_node.core import LineFeatureExtractor
 from line_feature_node.files import read_mask
 from line_feature_node.images import compressed_image_of, displayable, image_of, range_hint, usable_pixels
 from line_feature_node.messages import Messages
-from line_feature_node.monitor import Monitor, Throttle
+from line_feature_node.monitor import Monitor, Publishers, Throttle
 from line_feature_node.node_parameters import QOS_OVERRIDES, QOS_POLICIES, NodeParameters
 from line_feature_node.overlay import draw_overlay, encode_jpeg
 
 RCLError, UnknownROSArgsError = rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError
 
-#: Signals that end the node.
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 #: What the node publishes, by topic.
 OUTPUTS = {
     '~/segments': PointCloud2, '~/markers': ImageMarker, '~/overlay': Image, '~/overlay/compressed': CompressedImage,
@@ -105,7 +102,10 @@ class LineFeatureNode(LifecycleNode):
             ConfigurationError: A parameter has the wrong type or range or contradicts another, or the mask cannot be
                 read.
         """
-        super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
+        try:
+            super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
+        except ValueError as error:
+            raise ConfigurationError(self._empty_overrides() or str(error)) from None
         self._publishers_of: dict[str, Publisher] = {}
         self._subscription: Any = None
         self._active = False
@@ -126,6 +126,15 @@ class LineFeatureNode(LifecycleNode):
         self._survive_invalid_transitions()
         if self._settings.options.autostart:
             self._start()
+
+    def _empty_overrides(self) -> str:
+        """What is wrong with overrides that rclpy cannot declare, as an empty list has no type; '' where it is not."""
+        empty = [name for name, given in getattr(self, '_parameter_overrides', {}).items() if given.value in (None, [])]
+        return f'{", ".join(empty)} must have a value, got an empty one' if empty else ''
+
+    def warm_up(self) -> None:
+        """Compile the kernels, or load them, before they are needed."""
+        self._extractor.warm_up()
 
     def destroy_node(self) -> None:
         """Destroy the node with its state machine, which would keep it in the graph until the garbage is collected."""
@@ -201,7 +210,7 @@ class LineFeatureNode(LifecycleNode):
         options = self._settings.options
         self._mask = read_mask(Path(options.mask_file)) if options.mask_file else None
         begin = time.monotonic()
-        self._extractor.warm_up()
+        self.warm_up()
         self.get_logger().info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
         for topic, kind in OUTPUTS.items():
             self._publishers_of[topic] = self.create_publisher(
@@ -379,8 +388,10 @@ class LineFeatureNode(LifecycleNode):
     # Diagnostics
 
     def _publish_diagnostics(self) -> None:
-        # Those that do not fit, too: the subscription counts only those that it gets images from.
-        publishers = None if self._subscription is None else self.count_publishers(self._image_topic())
+        publishers = None
+        if self._subscription is not None:
+            known = self.count_publishers(self._image_topic())
+            publishers = Publishers(known, self._subscription.get_publisher_count())
         waiting = 'waits for a subscriber (lazy)' if self._active else 'not active'
         health = self._monitor.health(self._settings.options, publishers=publishers, waiting=waiting)
         status = DiagnosticStatus(
@@ -431,12 +442,12 @@ def _spin_while_all_is_well(node: LineFeatureNode, executor: SingleThreadedExecu
             node.get_logger().error(f'a callback failed: {error!r}')
 
 
-def run(args: list[str], stop: object = False) -> int:
+def run(args: list[str], ready: Callable[[], None]) -> int:
     """Run the node as a process until SIGINT or SIGTERM; return its exit status, 2 where it cannot start.
 
     Args:
         args: Those of the command line, with its name.
-        stop: Becomes true when such a signal came before the node was ready for it.
+        ready: Called when these signals end the node; until then they are to be taken care of by the caller.
     """
     _keep_memory()
     try:
@@ -445,13 +456,11 @@ def run(args: list[str], stop: object = False) -> int:
         print(f'line_feature_node cannot start: {" ".join(str(error).split())}', file=sys.stderr)
         rclpy.try_shutdown()
         return 2
-    # From here on rclpy shuts its context down, which ends the spinning; Python's own handlers do nothing.
-    for number in SIGNALS:
-        signal.signal(number, lambda *_: None)
+    # From here on rclpy shuts its context down, which ends the spinning. It calls the handlers from before, too.
     install_signal_handlers(SignalHandlerOptions.ALL)
+    ready()
     try:
-        if not stop:
-            spin(node)
+        spin(node)
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
@@ -479,4 +488,7 @@ def _started(args: list[str]) -> LineFeatureNode:
     unknown = remove_ros_args(args)[1:]
     if unknown:
         raise ConfigurationError(f'unknown argument {unknown[0]!r}: parameters stand behind --ros-args')
-    return LineFeatureNode()
+    node = LineFeatureNode()
+    # While the kernels are compiled for a life-cycle manager no signal would be heard: it finds them ready.
+    node.warm_up()
+    return node

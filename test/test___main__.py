@@ -33,8 +33,8 @@ def test_status_is_that_of_the_node(monkeypatch, status):
 
 def test_node_gets_the_command_line_with_its_name(monkeypatch):
     calls = []
-    started(monkeypatch, lambda arguments, stop: calls.append((arguments, bool(stop))) or 0, '--ros-args', '-p', 'n:=9')
-    assert calls == [(['line_feature_node', '--ros-args', '-p', 'n:=9'], False)]
+    started(monkeypatch, lambda arguments, _: calls.append(arguments) or 0, '--ros-args', '-p', 'n:=9')
+    assert calls == [['line_feature_node', '--ros-args', '-p', 'n:=9']]
 
 
 @pytest.mark.parametrize('argument', ['-h', '--help'])
@@ -55,19 +55,25 @@ def test_where_there_is_no_ros_it_is_said_so_in_one_line():
     assert 'source its setup.bash' in line
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_that_comes_early_ends_the_process_with_status_0(monkeypatch, number):
-    assert started(monkeypatch, lambda *_: signal.raise_signal(number) or 1) == 0
+IGNORING = """
+import signal, sys, types
+def run(arguments, ready):
+    if {ready}:
+        ready()
+    try:
+        signal.raise_signal({number})
+    except BaseException:
+        pass
+    return 7
+sys.modules['line_feature_node.node'] = types.SimpleNamespace(run=run)
+from line_feature_node.__main__ import main
+main()
+"""
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_whose_end_is_ignored_by_a_library_is_remembered(monkeypatch, number):
-    def run(arguments, stop):
-        assert not stop
-        try:
-            signal.raise_signal(number)
-        except SystemExit:
-            return 5 if stop else 6
-        return 7
-
-    assert started(monkeypatch, run) == 5
+@pytest.mark.parametrize(('ready', 'status'), [(False, 0), (True, 7)])
+def test_signal_ends_the_process_until_the_node_is_ready_whatever_is_ignored(number, ready, status):
+    """As a library does that calls Python back."""
+    code = IGNORING.format(ready=ready, number=int(number))
+    assert subprocess.run([sys.executable, '-c', code], check=False, timeout=60).returncode == status

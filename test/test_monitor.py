@@ -1,7 +1,7 @@
 import pytest
 
 from line_feature_node.core import STEPS
-from line_feature_node.monitor import LARGEST_JUMP, WINDOW, Level, Monitor, Throttle
+from line_feature_node.monitor import LARGEST_JUMP, WINDOW, Level, Monitor, Publishers, Throttle
 from line_feature_node.options import Options
 
 TIMES = dict(zip(STEPS, (0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007), strict=True))
@@ -34,7 +34,11 @@ def frames(monitor, sequence, latency=0.01, segments=7):
         monitor.process(latency, TIMES, segments)
 
 
-def health(monitor, publishers=1, waiting='waits', **options):
+#: The usual state of the image topic.
+ONE = Publishers(1, 1)
+
+
+def health(monitor, publishers=ONE, waiting='waits', **options):
     return monitor.health(Options(**options), publishers=publishers, waiting=waiting)
 
 
@@ -118,15 +122,16 @@ def test_silence_is_an_error_only_after_the_timeout(monitor, clock):
 
 def test_silence_without_a_publisher_says_so(monitor, clock):
     clock.now += 5
-    assert health(monitor, publishers=0).summary == 'no image for 5 s: the topic has no publisher'
+    assert health(monitor, publishers=Publishers(0, 0)).summary == 'no image for 5 s: the topic has no publisher'
 
 
-def test_silence_with_a_publisher_points_to_its_quality_of_service(monitor, clock):
+@pytest.mark.parametrize(('fitting', 'reason'), [
+    (0, 'does not fit, see the log for the quality of service'), (1, 'sends nothing, or its images are lost')])
+def test_silence_with_a_publisher_is_told_from_one_that_does_not_fit(monitor, clock, fitting, reason):
     clock.now += 5
-    state = health(monitor, publishers=1)
+    state = health(monitor, publishers=Publishers(2, fitting))
     assert state.level == Level.ERROR
-    assert 'though there is a publisher' in state.summary
-    assert 'QoS' in state.summary
+    assert reason in state.summary
 
 
 def test_new_subscription_gets_time_for_its_first_image(monitor, clock):

@@ -13,8 +13,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Log, ParameterValue
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -630,7 +630,7 @@ def test_mask_of_another_size_is_a_reason_for_each_frame(bench, mask_file, value
     pixels = np.full((30, 40), 9, np.float32)
     pixels[3, 4] = value
     check_bad_frame(bench, node, camera, segments, image(pixels, '32FC1'), image(picture()),
-                    'mask must have the shape of the image, (30, 40), got (60, 80)')
+                    'an image of 40×30 pixels: mask_file has 80×60')
 
 
 @pytest.mark.parametrize('content', [None, b'', b'no picture'])
@@ -946,7 +946,7 @@ def advance(node, seconds):
     node._monitor.clock = lambda: clock() + seconds
 
 
-@pytest.mark.parametrize(('publish', 'reason'), [(False, 'the topic has no publisher'), (True, 'there is a publisher')])
+@pytest.mark.parametrize(('publish', 'reason'), [(False, 'the topic has no publisher'), (True, 'sends nothing')])
 def test_silence_is_an_error(bench, publish, reason):
     node, camera = bench.node(lazy=False, image_timeout=5.0), bench.camera()
     bench.connect(camera, node)
@@ -966,7 +966,7 @@ def test_silence_by_incompatible_quality_of_service_is_not_said_to_be_for_want_o
     node = bench.node(lazy=False, **{'qos_overrides./image.subscription.reliability': 'reliable'})
     bench.until(lambda: REMEDY.search(bench.log), 'the warning')
     advance(node, 6)
-    assert 'no publisher' not in bench.health(node)[1]
+    assert 'does not fit, see the log' in bench.health(node)[1]
 
 
 def test_late_segments_are_a_warning(bench):
@@ -1191,15 +1191,17 @@ def spinning(bench):
 
 
 def malformed(bench):
+    """Ask for what fails in a callback, and wait until the node says so; what it prints meanwhile may be missed."""
+    log = bench.listen('/rosout', Log)
     client = bench.client(SetParameters, f'{NAME}/set_parameters')
     value = ParameterValue(type=99)
     client.call_async(SetParameters.Request(parameters=[ParameterMessage(name='T1', value=value)]))
+    bench.until(lambda: any('a callback failed: ' in entry.msg for entry in log), 'the error in the log')
 
 
 def test_malformed_request_does_not_end_the_spinning(bench, spinning):
     _, thread = spinning()
     malformed(bench)
-    bench.until(lambda: 'a callback failed: ' in bench.log, 'the error in the log')
     values = bench.wait(bench.parameters().get_parameters(['T1'])).values
     assert values[0].double_value == Parameters().T1
     assert thread.is_alive()
@@ -1208,7 +1210,6 @@ def test_malformed_request_does_not_end_the_spinning(bench, spinning):
 def test_node_processes_images_after_a_malformed_request(bench, spinning):
     node, _ = spinning()
     malformed(bench)
-    bench.until(lambda: 'a callback failed: ' in bench.log, 'the error in the log')
     camera, segments = bench.camera(), bench.listen()
     assert segments_of(bench.result(camera, node, segments, image(picture()))).size > 0
 

@@ -170,6 +170,14 @@ def test_override_in_the_other_case_is_warned_of_with_what_was_meant(bench, wron
     assert f'did you mean {right!r}?' in bench.warnings()[0]
 
 
+@pytest.mark.parametrize('name', ['roi', 'nonsense'])
+def test_empty_list_at_the_start_is_refused_by_its_name(bench, tmp_path, name):
+    path = tmp_path / 'some.yaml'
+    path.write_text(f'/**: {{ros__parameters: {{T1: 9.0, {name}: []}}}}')
+    with pytest.raises(ConfigurationError, match=f'^{name} must have a value'):
+        bench.node('--params-file', str(path))
+
+
 def test_override_like_no_parameter_is_warned_of_by_its_name(bench):
     bench.node(xyzzy_plugh=5.0)
     [line] = bench.warnings()

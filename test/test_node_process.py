@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from rclpy.parameter import parameter_value_to_python
@@ -20,12 +21,12 @@ START = 60.0
 class Process:
     """A node that runs beside the test; what it says goes into a file."""
 
-    def __init__(self, folder, *arguments):
+    def __init__(self, folder, *arguments, **environment):
         self.path = folder / 'log'
         with self.path.open('wb') as log:
             self.process = subprocess.Popen(
                 [sys.executable, '-m', 'line_feature_node', *arguments], stdout=log, stderr=log, cwd=folder,
-                env={**os.environ, 'ROS_LOG_DIR': str(folder / 'ros')})
+                env={**os.environ, 'ROS_LOG_DIR': str(folder / 'ros'), **environment})
 
     @property
     def log(self):
@@ -91,6 +92,23 @@ def test_signal_ends_the_node_with_status_0(start, number):
 def test_signal_while_the_node_becomes_ready_ends_it_with_status_0(start):
     process = start(word='kernels are ready')
     assert process.end() == 0
+    assert 'Traceback' not in process.log
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('autostart', ['true', 'false'])
+def test_signal_while_kernels_are_compiled_ends_the_node_at_once(tmp_path, number, autostart):
+    """Where nothing is compiled yet; the compiler calls Python back, and exceptions are lost there."""
+    cache = tmp_path / 'cache'
+    process = Process(tmp_path, '--ros-args', '-p', f'autostart:={autostart}', NUMBA_CACHE_DIR=str(cache))
+    end = time.monotonic() + START
+    while not list(cache.rglob('*.nbc')) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert list(cache.rglob('*.nbc')), process.log
+    time.sleep(0.7)  # into the next kernel
+    process.process.send_signal(number)
+    assert process.process.wait(5) == 0
+    assert 'ready; waits' not in process.log
     assert 'Traceback' not in process.log
 
 
