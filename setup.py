@@ -29,7 +29,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     install_requires=[
-        'PyYAML>=6', 'numba>=0.59', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'rosbags>=0.10',
+        'PyYAML>=6', 'numba>=0.58', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'rosbags>=0.10',
         'typer>=0.9',
     ],
     extras_require={

@@ -202,6 +202,7 @@ def _table_of_drive(outcome: Any) -> Table:
         table.add_row('error of orientation and position',
                       f'{np.degrees(found["angle"]):.2f} degrees, {found["offset"]:.2f} px')
     table.add_row('what the node says of itself', outcome.health)
+    table.add_row('and of its images', outcome.counts)
     return table
 
 

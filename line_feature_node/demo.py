@@ -25,6 +25,7 @@ from std_msgs.msg import Header
 from line_feature_node.core import end_points
 from line_feature_node.images import decode
 from line_feature_node.messages import segments_of
+from line_feature_node.monitor import Level
 from line_feature_node.node import MESSAGES
 from line_feature_node.scenes import Camera, Scene, corridor
 from line_feature_node.truth import Agreement, compare
@@ -39,6 +40,8 @@ RELIABLE = ['-p', 'qos_overrides./image.subscription.reliability:=reliable',
             '-p', 'qos_overrides./image.subscription.depth:=30']
 #: Seconds that the last results have to arrive.
 GRACE = 10.0
+#: Counts of the node that are shown.
+COUNTED = ('processed', 'dropped', 'failed')
 #: Metres that the robot drives, from the first frame to the last.
 DRIVE = (2.0, 14.0)
 
@@ -53,7 +56,7 @@ class Outcome:
         agreements: How the segments of each agree with the ground truth.
         segments: Segments of each.
         overlay: The last overlay, H×W×3 BGR; None where none came.
-        health: What the node last said of itself.
+        health, counts: What the node last said of itself, and of its frames.
     """
 
     published: int
@@ -62,6 +65,7 @@ class Outcome:
     segments: list[int] = field(default_factory=list)
     overlay: NDArray[np.uint8] | None = None
     health: str = ''
+    counts: str = ''
 
 
 def render(frames: int) -> list[Scene]:
@@ -181,4 +185,7 @@ class _Player:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         if self._outcome.segments:
-            self._outcome.health = message.status[0].message
+            status = message.status[0]
+            values = {value.key: value.value for value in status.values}
+            self._outcome.health = f'{Level(status.level[0]).name}: {status.message}'
+            self._outcome.counts = ', '.join(f'{values[f"frames {name}"]} {name}' for name in COUNTED)

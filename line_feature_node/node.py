@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from line_feature_node.messages import Messages
 from line_feature_node.monitor import Monitor, Publishers, Throttle
 from line_feature_node.node_parameters import QOS_OVERRIDES, QOS_POLICIES, NodeParameters
 from line_feature_node.overlay import draw_overlay, encode_jpeg
+from line_feature_node.parameter_files import read_parameter_file
 
 RCLError, UnknownROSArgsError = rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError
 
@@ -119,6 +121,8 @@ class LineFeatureNode(LifecycleNode):
         except (TypeError, ValueError) as error:
             self.destroy_node()
             raise ConfigurationError(str(error)) from None
+        own, of_process = options.get('cli_args') or [], options.get('use_global_arguments', True)
+        self._warn_of_idle_files([*own, *(sys.argv if of_process else [])])
         self._extractor = LineFeatureExtractor(self._settings.parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', OUTPUT_DEPTH)
         # Health is told while a simulation stands still, too.
@@ -131,6 +135,18 @@ class LineFeatureNode(LifecycleNode):
         """What is wrong with overrides that rclpy cannot declare, as an empty list has no type; '' where it is not."""
         empty = [name for name, given in getattr(self, '_parameter_overrides', {}).items() if given.value in (None, [])]
         return f'{", ".join(empty)} must have a value, got an empty one' if empty else ''
+
+    def _warn_of_idle_files(self, args: list[str]) -> None:
+        """Say so where a parameter file of a command line has nothing for this node: rcl passes over it silently."""
+        pairs = list(pairwise(args))
+        single = {after.partition(':=')[0].rpartition(':')[2] for flag, after in pairs if flag in ('-p', '--param')}
+        for path in (after for flag, after in pairs if flag == '--params-file'):
+            values, unknown = read_parameter_file(Path(path))
+            names = {*values, *unknown} - single
+            if names and not names & self._parameter_overrides.keys():
+                self.get_logger().warning(
+                    f'nothing in {path} is for {self.get_fully_qualified_name()}: the name of a section in it must be '
+                    f'this one, or /** for any node')
 
     def warm_up(self) -> None:
         """Compile the kernels, or load them, before they are needed."""
@@ -148,7 +164,7 @@ class LineFeatureNode(LifecycleNode):
                 raise ConfigurationError(self._problem)
 
     def _survive_invalid_transitions(self) -> None:
-        """Refuse what a client asks for in the wrong state; rclpy would raise, which ends the spinning."""
+        """Refuse what a client asks for in the wrong state: rclpy of Jazzy (7.1) raises, which ends the spinning."""
         for service in self.services:
             if service.srv_type is ChangeState:
                 service.callback = self._refusing(service.callback)
@@ -178,11 +194,13 @@ class LineFeatureNode(LifecycleNode):
     def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Stop processing images; parameters and publishers stay."""
         self._deactivate()
+        self.get_logger().info('deactivated')
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Give back what configuring made."""
         self._clean_up()
+        self.get_logger().info('cleaned up')
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:

@@ -126,10 +126,15 @@ def _check_qos(name: str, value: Any) -> None:
 def _warn_of_unknown(node: Node, overrides: Iterable[str], names: set[str]) -> None:
     for name in overrides:
         if name not in names:
-            similar = {known.lower(): known for known in names}
-            closest = difflib.get_close_matches(name.lower(), similar, n=1, cutoff=0.5)
+            similar = {_folded(known): known for known in names}
+            closest = difflib.get_close_matches(_folded(name), similar, n=1, cutoff=0.5)
             hint = f': did you mean {similar[closest[0]]!r}?' if closest else ''
             node.get_logger().warning(f'there is no parameter {name!r}, what it is set to has no effect{hint}')
+
+
+def _folded(name: str) -> str:
+    """A name in which what looks alike is alike, as T1 and Tl."""
+    return name.lower().translate(str.maketrans('lo', '10'))
 
 
 def _converted(name: str, value: Any) -> Any:

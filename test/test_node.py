@@ -1027,6 +1027,7 @@ def test_nothing_is_published_while_the_node_is_not_active(bench, counted):
     camera.publish(image(picture()))
     bench.work_off()
     assert not any(counts.values())
+    assert 'deactivated' in bench.log
     assert bench.health(node)[1] == 'not active'
     assert bench.change(Transition.TRANSITION_ACTIVATE)
     assert bench.result(camera, node, segments, image(picture(), stamp=(5, 6))).header.stamp.sec == 5
@@ -1055,6 +1056,7 @@ def test_node_goes_round_its_life_cycle_again(bench):
         assert bench.change(Transition.TRANSITION_DEACTIVATE)
         assert bench.change(Transition.TRANSITION_CLEANUP)
         assert bench.state() == State.PRIMARY_STATE_UNCONFIGURED
+        assert 'cleaned up' in bench.log
         bench.until(lambda: not node.count_publishers(SEGMENTS) and not subscribers(bench), 'end of the topics')
         assert bench.change(Transition.TRANSITION_CONFIGURE)
         assert bench.change(Transition.TRANSITION_ACTIVATE)

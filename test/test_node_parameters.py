@@ -164,8 +164,8 @@ def test_misspelt_override_is_warned_of_with_what_was_meant(bench, wrong, right)
     assert not node.has_parameter(wrong)
 
 
-@pytest.mark.parametrize(('wrong', 'right'), [('t1', 'T1'), ('t2', 'T2'), ('N', 'n'), ('ROI', 'roi')])
-def test_override_in_the_other_case_is_warned_of_with_what_was_meant(bench, wrong, right):
+@pytest.mark.parametrize(('wrong', 'right'), [('t1', 'T1'), ('t2', 'T2'), ('N', 'n'), ('ROI', 'roi'), ('Tl', 'T1')])
+def test_override_that_looks_alike_is_warned_of_with_what_was_meant(bench, wrong, right):
     bench.node(**{wrong: 5.0})
     assert f'did you mean {right!r}?' in bench.warnings()[0]
 
@@ -176,6 +176,14 @@ def test_empty_list_at_the_start_is_refused_by_its_name(bench, tmp_path, name):
     path.write_text(f'/**: {{ros__parameters: {{T1: 9.0, {name}: []}}}}')
     with pytest.raises(ConfigurationError, match=f'^{name} must have a value'):
         bench.node('--params-file', str(path))
+
+
+@pytest.mark.parametrize(('section', 'warned'), [('lines', True), ('line_feature_node', False)])
+def test_parameter_file_is_warned_of_where_the_node_is_in_the_same_process(bench, tmp_path, section, warned):
+    path = tmp_path / 'some.yaml'
+    path.write_text(f'{section}: {{ros__parameters: {{T1: 9.0}}}}')
+    bench.node('--params-file', str(path))
+    assert bench.warnings() == [] if not warned else f'nothing in {path} is for /line' in bench.warnings()[0]
 
 
 def test_override_like_no_parameter_is_warned_of_by_its_name(bench):

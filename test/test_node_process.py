@@ -66,6 +66,19 @@ def refused(folder, *arguments):
     return done.stderr
 
 
+IDLE = 'is for /line_feature_node: the name of a section in it must be this one'
+
+
+@pytest.mark.parametrize(('section', 'arguments', 'warned'), [
+    ('lines', [], True), ('lines', ['-p', 'T2:=2.5'], True), ('/front/line_feature_node', [], True),
+    ('line_feature_node', [], False), ('/**', [], False), ('/**', ['-p', 'T1:=9.5'], False)])
+def test_parameter_file_without_anything_for_the_node_is_warned_of(start, tmp_path, section, arguments, warned):
+    path = tmp_path / 'some.yaml'
+    path.write_text(f'{section}: {{ros__parameters: {{T1: 9.0}}}}')
+    process = start('--ros-args', '--params-file', str(path), *arguments, '-p', 'lazy:=false')
+    assert (IDLE in process.log) == warned
+
+
 def over_dds(bench, topic, segments_topic, pixels):
     """The segments that a process makes of a picture that is published here, until one of them arrives."""
     messages = bench.listen(segments_topic)

@@ -22,9 +22,9 @@ def region(roi: tuple[float, float, float, float], width: int, height: int) -> t
         ValueError: Nothing of the region lies in the picture.
     """
     x, y, w, h = roi
-    units = (1, 1) if max(roi) > 1 else (width, height)
-    left, right = (min(round(value * units[0]), width) for value in (x, x + w))
-    top, bottom = (min(round(value * units[1]), height) for value in (y, y + h))
+    x_unit, y_unit = (1, 1) if max(roi) > 1 else (width, height)  # pixels
+    left, right = (min(round(value * x_unit), width) for value in (x, x + w))
+    top, bottom = (min(round(value * y_unit), height) for value in (y, y + h))
     if left >= right or top >= bottom:
         raise ValueError(f'roi {list(roi)} leaves nothing of an image of {width}×{height} pixels')
     return left, top, right - left, bottom - top
