@@ -72,6 +72,7 @@ class Frame:
         seconds: What the extraction took.
         orientations: Length of segments, pixels, in 18 bands of 10 degrees from -90.
         agreement: Precision, recall, angle (radians) and offset (pixels) where there is a truth.
+        header_stamp: Nanoseconds, what the header of the image says; 0 where it says nothing.
         messages: Serialised, by the ending of their topic; under CSV the segments as lines of text.
     """
 
@@ -83,6 +84,7 @@ class Frame:
     seconds: float = 0.0
     orientations: list[float] = field(default_factory=list)
     agreement: list[float] = field(default_factory=list)
+    header_stamp: int = 0
     messages: dict[str, bytes] = field(default_factory=dict)
 
 
@@ -138,6 +140,7 @@ def _process(
     """Fill in what becomes of a frame; what is wrong with it is its error."""
     try:
         message = deserialize(path, data, msgtype)
+        frame.header_stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         image = DECODERS[msgtype](message)
         begin = time.perf_counter()
         segments = extractor.extract(image, usable_pixels(image, job.mask))
