@@ -24,20 +24,23 @@ def fail(message: str) -> NoReturn:
 def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command, which takes `parameters`, options for a file, for `profile` and for each of Parameters instead.
 
-    What is given as an option wins over what the file says, and that over the profile.
+    What is given as an option wins over what the file says, and that over the profile. A command that takes `profile`
+    gets the name of the one they started from.
     """
 
     def run(params_file: Path | None, profile: str | None, **values: Any) -> None:
         own = {name: values.pop(name) for name in kept}
         given = {name: value for name, value in values.items() if value is not None}
         try:
-            parameters = _parameters(params_file, profile, given)
+            own['profile'], parameters = _parameters(params_file, profile, given)
         except (TypeError, ValueError) as error:
             raise typer.BadParameter(str(error)) from None
+        if 'profile' not in signature.parameters:
+            del own['profile']
         command(**own, parameters=parameters)
 
     signature = inspect.signature(command)
-    kept = [name for name in signature.parameters if name != 'parameters']
+    kept = [name for name in signature.parameters if name not in ('parameters', 'profile')]
     options: dict[str, tuple[Any, str]] = {
         'params-file': (Path, 'Parameter file (YAML) of a ROS 2 node, whose values are taken.'),
         'profile': (str, f'Set of parameters to start from: {", ".join(PROFILES)}; default default.')}
@@ -58,9 +61,11 @@ def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _parameters(path: Path | None, profile: str | None, given: dict[str, Any]) -> Parameters:
+def _parameters(path: Path | None, profile: str | None, given: dict[str, Any]) -> tuple[str, Parameters]:
+    """The name of the profile that is started from, and what comes of it."""
     values, unknown = read_parameter_file(path) if path else ({}, [])
     for name in unknown:
         errors.print(f'{path}: there is no parameter {name!r}, what it is set to has no effect', markup=False)
     own = {name: value for name, value in values.items() if name in Parameters.specs()}
-    return Parameters.profile(profile or values.get('profile', 'default'), **{**own, **given})
+    name = profile or values.get('profile', 'default')
+    return name, Parameters.profile(name, **{**own, **given})

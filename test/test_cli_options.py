@@ -46,6 +46,24 @@ def test_options_win_over_the_file_and_that_over_the_profile(run, tmp_path):
     assert "no parameter 'nonsense'" in result.stderr
 
 
+@pytest.mark.parametrize(('arguments', 'name'), [
+    ([], 'default'), (['--params-file', 'some.yaml'], 'corridor'),
+    (['--params-file', 'some.yaml', '--profile', 'paper'], 'paper')])
+def test_a_command_may_ask_for_the_name_of_the_profile(tmp_path, monkeypatch, arguments, name):
+    kept = []
+
+    def command(parameters: Parameters, profile: str) -> None:
+        kept.append((parameters, profile))
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'some.yaml').write_text('/**: {ros__parameters: {profile: corridor}}')
+    app = typer.Typer()
+    app.command()(with_parameters(command))
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert kept == [(Parameters.profile(name), name)]
+
+
 def test_a_list_takes_its_numbers_one_by_one(run):
     assert run('--roi', 0, 0.5, 1, 0.5)[1].roi == (0.0, 0.5, 1.0, 0.5)
 
