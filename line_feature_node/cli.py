@@ -16,12 +16,10 @@ from line_feature_node.cli_options import console, errors, fail, with_parameters
 from line_feature_node.core import STEPS, Parameters, end_points
 from line_feature_node.figures import sheet
 from line_feature_node.images import decode, displayable
+from line_feature_node.overlay import SECTIONS
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-#: The edges that a direction code stands for: its section of the gradient, and what lies across it.
-SECTIONS = {1: 'vertical', 2: 'rising', 3: 'horizontal', 4: 'falling'}
 
 Out = Annotated[Path, typer.Option(help='Folder for the overlays and tables.')]
 

@@ -10,6 +10,8 @@ from line_feature_node.core import end_points
 
 #: Colours (BGR) of the direction codes 1 to 4, told apart by colour-blind eyes too (after Okabe and Ito).
 COLOURS = {1: (0, 94, 213), 2: (115, 158, 0), 3: (233, 180, 86), 4: (66, 228, 240)}
+#: The edges that a direction code stands for: its section of the gradient, and what lies across it.
+SECTIONS = {1: 'vertical', 2: 'rising', 3: 'horizontal', 4: 'falling'}
 #: Brightness that is left of the picture, so that the segments stand out.
 BACKGROUND = 0.7
 #: The longest side that libjpeg accepts.
