@@ -18,6 +18,7 @@ from line_feature_node.cli_options import console, errors, fail
 from line_feature_node.core import Parameters
 from line_feature_node.files import read_mask
 from line_feature_node.recordings import RecordingError, find_recordings
+from line_feature_node.report import check_report, write_report
 from line_feature_node.slices import OUTPUTS, Frame, Job
 from line_feature_node.workers import Workers, WorkersError, cluster, local
 
@@ -37,6 +38,7 @@ def bag(
     recordings: Annotated[list[Path], typer.Argument(
         metavar='IN', readable=False, help='Recordings (.bag, .mcap, .db3, folders of ROS 2), or folders of them.')],
     parameters: Parameters,
+    profile: str,
     out: Annotated[Path, typer.Option(help='The new bag; of several recordings, the folder for theirs.')],
     topic: Annotated[Optional[list[str]], typer.Option(help='Topic of images; all of them unless given.')] = None,
     start: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to start at.')] = None,
@@ -48,6 +50,7 @@ def bag(
     only_segments: Annotated[bool, typer.Option('--only-segments', help='Neither markers nor overlays.')] = False,
     mask_file: Annotated[Optional[Path], typer.Option(help='Image file, black where no edges are wanted.')] = None,
     truth: Annotated[bool, typer.Option('--truth', help='Compare with true segments on TOPIC/truth.')] = False,
+    report: Annotated[Optional[Path], typer.Option(help='Write a page (HTML) about the run.')] = None,
     workers: Annotated[Optional[int], typer.Option(min=1, help='Processes; as many as processors.')] = None,
     scheduler: Annotated[Optional[str], typer.Option(help='Dask scheduler instead, tcp://host:port.')] = None,
     resume: Annotated[bool, typer.Option('--resume', help='Go on from what an interrupted run left.')] = False,
@@ -64,26 +67,36 @@ def bag(
     try:
         mask = read_mask(mask_file) if mask_file else None
         sources = find_recordings(recordings)
+        pairs = list(_targets(sources, out))
+        if report:
+            check_report(report, pairs, overwrite=overwrite)
         crew = cluster(scheduler) if scheduler else local(workers)
-    except (RecordingError, WorkersError, ValueError) as error:
+    except (RecordingError, TargetError, WorkersError, ValueError) as error:
         fail(str(error))
     job = Job(parameters, mask, outputs=('segments',) if only_segments else tuple(OUTPUTS), truth=truth, csv=csv)
     run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)
     outcomes = []
     try:
         with _interruptible():
-            for source, target in _targets(sources, out):
+            for source, target in pairs:
                 outcomes.append(_process(source, target, run, crew, quiet=quiet or as_json))
     except _Interrupted as error:
         errors.print(f'{error.number.name}: ended before all was done; --resume goes on from there', markup=False)
         raise typer.Exit(INTERRUPTED[error.number]) from None
+    status = _status(outcomes)
+    if report:
+        try:
+            write_report(report, outcomes, run, profile, overwrite=overwrite)
+        except TargetError as error:
+            errors.print(str(error), markup=False)
+            status = max(status, 1)
     if as_json:
         print(json.dumps({'recordings': [_summary(outcome) for outcome in outcomes]}))
     elif not quiet:
         for outcome in outcomes:
             if outcome.frames:
                 console.print(_table(outcome))
-    raise typer.Exit(_status(outcomes))
+    raise typer.Exit(status)
 
 
 def _targets(sources: list[Path], out: Path) -> Iterator[tuple[Path, Path]]:

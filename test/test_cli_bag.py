@@ -74,3 +74,31 @@ def test_signals_leave_no_target(tmp_path, number, status):
     assert '--resume goes on from there' in errors
     assert 'Traceback' not in errors
     assert not (tmp_path / 'out' / 'corridor').exists()
+
+
+def test_a_page_about_the_run_is_written(tmp_path):
+    report = tmp_path / 'report.html'
+    arguments = (BAGS, '--out', tmp_path / 'out', '--end', 0.5, '--quiet', '--profile', 'corridor', '--report', report)
+    result = run(*arguments)
+    assert (result.exit_code, result.output) == (0, '')
+    page = report.read_text(encoding='utf-8')
+    assert 'Line features of 2 recordings' in page
+    assert 'Profile corridor' in page
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert result.stderr.strip() == f'the report {report} exists: --overwrite replaces it'
+
+
+def test_a_page_that_cannot_be_written_is_told_before_the_work(tmp_path):
+    result = run(BAGS, '--out', tmp_path / 'out', '--report', tmp_path / 'none' / 'report.html')
+    assert result.exit_code == 2
+    assert result.stderr.strip() == (
+        f'cannot write {tmp_path}/none/report.html: there is no folder {tmp_path}/none')
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_page_tells_of_recordings_that_cannot_be_read(tmp_path):
+    (tmp_path / 'empty.bag').touch()
+    result = run(tmp_path / 'empty.bag', '--out', tmp_path / 'out', '--report', tmp_path / 'report.html')
+    assert result.exit_code == 2
+    assert 'the file is empty' in (tmp_path / 'report.html').read_text(encoding='utf-8')
