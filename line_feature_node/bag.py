@@ -43,8 +43,6 @@ VERSION: Literal[9] = 9
 NO_IMAGES = 'no images to be processed'
 #: What definitions that are wrong or missing raise: the parser, the table of types, and their use.
 UNKNOWN_TYPES = (AssertionError, KeyError, TypesysError, ValueError)
-#: Overlays that are kept for the report.
-SAMPLES = 8
 
 
 class TargetError(OSError):
@@ -84,7 +82,6 @@ class Outcome:
     Attributes:
         source, target: The recording and the bag that was made of it.
         frames: All of them, without their messages.
-        overlays: Bytes of JPEGs of some frames, with their topic and stamp.
         error: Why nothing came of it, one sentence; '' where something did.
         uncopied: Topics that could not be copied.
     """
@@ -92,7 +89,6 @@ class Outcome:
     source: Path
     target: Path
     frames: list[Frame] = field(default_factory=list)
-    overlays: list[tuple[str, int, bytes]] = field(default_factory=list)
     error: str = ''
     uncopied: list[str] = field(default_factory=list)
 
@@ -247,13 +243,8 @@ class _Work:
         for topic in self._offsets:
             self._offsets[topic] += sum(frame.topic == topic for frame in frames)
         self._write_messages(number, part, frames)
-        sampled = number in {len(self._slices) * k // SAMPLES for k in range(SAMPLES)}
         for frame in frames:
             self._write_text(frame)
-            overlay = frame.messages.get('overlay')
-            if overlay and sampled:
-                sampled = False
-                outcome.overlays.append((frame.topic, frame.stamp, overlay))
             bare = replace(frame, messages={})
             outcome.frames.append(bare)
             yield bare
