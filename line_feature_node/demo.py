@@ -127,6 +127,7 @@ class _Player:
         self._scenes = scenes
         self._outcome = Outcome(len(scenes))
         self._sent: dict[int, float] = {}
+        self._told = False
         self._node = rclpy.create_node('line_feature_demo', context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self._node)
@@ -145,7 +146,9 @@ class _Player:
             for number, scene in enumerate(self._scenes):
                 self._wait_until(begin + number / RATE)
                 self._publish(number, scene)
-            self._spin(lambda: not self._sent and self._outcome.health != '', GRACE)
+            self._spin(lambda: not self._sent, GRACE)
+            self._told = False
+            self._spin(lambda: self._told, GRACE)
             return self._outcome
         finally:
             self._executor.shutdown()
@@ -188,4 +191,5 @@ class _Player:
             status = message.status[0]
             values = {value.key: value.value for value in status.values}
             self._outcome.health = f'{Level(status.level[0]).name}: {status.message}'
+            self._told = True
             self._outcome.counts = ', '.join(f'{values[f"frames {name}"]} {name}' for name in COUNTED)

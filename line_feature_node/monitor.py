@@ -70,10 +70,12 @@ class Publishers(NamedTuple):
     Attributes:
         all: Those that are known of.
         fitting: Those of them whose quality of service fits.
+        foreign: Message type of one that sends another than is subscribed to; '' where all send that.
     """
 
     all: int
     fitting: int
+    foreign: str = ''
 
 
 @dataclass
@@ -204,6 +206,8 @@ class Monitor:
 def _reason_of_silence(publishers: Publishers) -> str:
     if not publishers.all:
         return 'the topic has no publisher'
+    if not publishers.fitting and publishers.foreign:
+        return f'a publisher sends {publishers.foreign}, see the parameter image_transport'
     if not publishers.fitting:
         return 'what its publishers offer does not fit, see the log for the quality of service'
     return 'a publisher is there that sends nothing, or its images are lost on the way (docs/transport.md)'

@@ -25,6 +25,7 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.logging import get_logger
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind, QoSProfile, QoSReliabilityPolicy, qos_policy_name_from_kind
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -44,6 +45,8 @@ from line_feature_node.parameter_files import read_parameter_file
 
 RCLError, UnknownROSArgsError = rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError
 
+#: What it subscribes to, by `image_transport`.
+IMAGE_TYPES = {'raw': 'sensor_msgs/msg/Image', 'compressed': 'sensor_msgs/msg/CompressedImage'}
 #: What the node publishes, by topic.
 OUTPUTS = {
     '~/segments': PointCloud2, '~/markers': ImageMarker, '~/overlay': Image, '~/overlay/compressed': CompressedImage,
@@ -141,16 +144,15 @@ class LineFeatureNode(LifecycleNode):
         pairs = list(pairwise(args))
         single = {after.partition(':=')[0].rpartition(':')[2] for flag, after in pairs if flag in ('-p', '--param')}
         for path in (after for flag, after in pairs if flag == '--params-file'):
-            values, unknown = read_parameter_file(Path(path))
+            try:
+                values, unknown = read_parameter_file(Path(path))
+            except ValueError:  # rcl reads other YAML than Python does, and took it
+                continue
             names = {*values, *unknown} - single
             if names and not names & self._parameter_overrides.keys():
                 self.get_logger().warning(
                     f'nothing in {path} is for {self.get_fully_qualified_name()}: the name of a section in it must be '
                     f'this one, or /** for any node')
-
-    def warm_up(self) -> None:
-        """Compile the kernels, or load them, before they are needed."""
-        self._extractor.warm_up()
 
     def destroy_node(self) -> None:
         """Destroy the node with its state machine, which would keep it in the graph until the garbage is collected."""
@@ -227,9 +229,7 @@ class LineFeatureNode(LifecycleNode):
     def _configure(self) -> None:
         options = self._settings.options
         self._mask = read_mask(Path(options.mask_file)) if options.mask_file else None
-        begin = time.monotonic()
-        self.warm_up()
-        self.get_logger().info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
+        warm_up(self._extractor, self.get_logger())
         for topic, kind in OUTPUTS.items():
             self._publishers_of[topic] = self.create_publisher(
                 kind, topic, QoSProfile(depth=OUTPUT_DEPTH), qos_overriding_options=QoSOverridingOptions(POLICIES),
@@ -408,8 +408,10 @@ class LineFeatureNode(LifecycleNode):
     def _publish_diagnostics(self) -> None:
         publishers = None
         if self._subscription is not None:
-            known = self.count_publishers(self._image_topic())
-            publishers = Publishers(known, self._subscription.get_publisher_count())
+            wanted, topic = IMAGE_TYPES[self._settings.options.image_transport], self._image_topic()
+            types = [known.topic_type for known in self.get_publishers_info_by_topic(topic)]
+            publishers = Publishers(len(types), self._subscription.get_publisher_count(),
+                                    next((kind for kind in types if kind != wanted), ''))
         waiting = 'waits for a subscriber (lazy)' if self._active else 'not active'
         health = self._monitor.health(self._settings.options, publishers=publishers, waiting=waiting)
         status = DiagnosticStatus(
@@ -485,6 +487,14 @@ def run(args: list[str], ready: Callable[[], None]) -> int:
     return 0
 
 
+def warm_up(extractor: LineFeatureExtractor, logger: Any) -> None:
+    """Compile the kernels, or load them."""
+    logger.info('loading the kernels; the first time they are compiled, which takes 15 to 30 s')
+    begin = time.monotonic()
+    extractor.warm_up()
+    logger.info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
+
+
 def _keep_memory() -> None:
     """Let the C library keep the memory of large messages, where the user has not said otherwise.
 
@@ -506,7 +516,6 @@ def _started(args: list[str]) -> LineFeatureNode:
     unknown = remove_ros_args(args)[1:]
     if unknown:
         raise ConfigurationError(f'unknown argument {unknown[0]!r}: parameters stand behind --ros-args')
-    node = LineFeatureNode()
-    # While the kernels are compiled for a life-cycle manager no signal would be heard: it finds them ready.
-    node.warm_up()
-    return node
+    # Before there is a node: a signal may end the process at once meanwhile, and nobody waits for an answer.
+    warm_up(LineFeatureExtractor(), get_logger('line_feature_node'))
+    return LineFeatureNode()

@@ -25,19 +25,33 @@ def read_parameter_file(path: Path) -> tuple[dict[str, Any], list[str]]:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except OSError as error:
         raise ValueError(f'{path}: {error.strerror}') from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+    except (ValueError, yaml.YAMLError) as error:  # not UTF-8, or a date that does not exist
         raise ValueError(f'{path}: not YAML ({" ".join(str(error).split())})') from None
-    sections = [section['ros__parameters'] for section in _sections(content)]
+    try:
+        sections = [section['ros__parameters'] for section in _sections(content)]
+    except RecursionError:
+        raise ValueError(f'{path}: what it says contains itself, or is nested too deep') from None
     if not sections:
         raise ValueError(f'{path}: no ros__parameters in it, as parameter files of ROS 2 have them')
     values: dict[str, Any] = {}
     for section in sections:
         if not isinstance(section, dict):
             raise ValueError(f'{path}: ros__parameters must be names with values, got {section!r}')
-        values.update(section)
+        values.update(_flattened(section))
     known = {*Parameters.specs(), *Options.specs()}
     return ({name: value for name, value in values.items() if name in known},
             [str(name) for name in values if name not in known])
+
+
+def _flattened(section: dict[str, Any], before: str = '') -> dict[str, Any]:
+    """Values by their full names: a mapping in it stands for names that begin with its own and a point."""
+    values: dict[str, Any] = {}
+    for name, value in section.items():
+        if isinstance(value, dict):
+            values |= _flattened(value, f'{before}{name}.')
+        else:
+            values[f'{before}{name}'] = value
+    return values
 
 
 def _sections(content: Any) -> list[dict[str, Any]]:

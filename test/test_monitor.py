@@ -125,11 +125,14 @@ def test_silence_without_a_publisher_says_so(monitor, clock):
     assert health(monitor, publishers=Publishers(0, 0)).summary == 'no image for 5 s: the topic has no publisher'
 
 
-@pytest.mark.parametrize(('fitting', 'reason'), [
-    (0, 'does not fit, see the log for the quality of service'), (1, 'sends nothing, or its images are lost')])
-def test_silence_with_a_publisher_is_told_from_one_that_does_not_fit(monitor, clock, fitting, reason):
+@pytest.mark.parametrize(('publishers', 'reason'), [
+    (Publishers(2, 0), 'does not fit, see the log for the quality of service'),
+    (Publishers(2, 0, 'std_msgs/msg/String'), 'sends std_msgs/msg/String, see the parameter image_transport'),
+    (Publishers(2, 1), 'sends nothing, or its images are lost'),
+    (Publishers(2, 1, 'std_msgs/msg/String'), 'sends nothing, or its images are lost')])
+def test_silence_with_a_publisher_is_told_from_one_that_does_not_fit(monitor, clock, publishers, reason):
     clock.now += 5
-    state = health(monitor, publishers=Publishers(2, fitting))
+    state = health(monitor, publishers=publishers)
     assert state.level == Level.ERROR
     assert reason in state.summary
 

@@ -7,9 +7,10 @@ import sys
 import time
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from test_node import DEADLINE, expected, image, picture
 
 from line_feature_node.messages import segments_of
@@ -77,6 +78,17 @@ def test_parameter_file_without_anything_for_the_node_is_warned_of(start, tmp_pa
     path.write_text(f'{section}: {{ros__parameters: {{T1: 9.0}}}}')
     process = start('--ros-args', '--params-file', str(path), *arguments, '-p', 'lazy:=false')
     assert (IDLE in process.log) == warned
+
+
+@pytest.mark.parametrize('text', [
+    '', '# nothing', '/**: {ros__parameters: {camera: {fps: 30}}}', 'a: {ros__parameters: {day: 2024-13-45}}',
+    '/**: {ros__parameters: {qos_overrides: {/image: {subscription: {depth: 20}}}}}'])
+def test_parameter_file_of_any_kind_that_ros_accepts_lets_the_node_start(start, tmp_path, text):
+    path = tmp_path / 'some.yaml'
+    path.write_text(text)
+    process = start('--ros-args', '--params-file', str(path), '-p', 'lazy:=false')
+    assert IDLE not in process.log
+    assert ('depth 20' in process.log) == ('depth' in text)
 
 
 def over_dds(bench, topic, segments_topic, pixels):
@@ -196,3 +208,12 @@ def test_usage_is_shown_when_asked_for(tmp_path):
                           timeout=START, check=False, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert done.stdout.startswith('usage: line_feature_node ')
+
+
+def test_images_of_another_type_are_named_in_the_diagnostics(bench, start):
+    """Not in one process: there a topic has one type."""
+    bench.camera(kind=CompressedImage)
+    start('--ros-args', '-p', 'lazy:=false', '-p', 'image_timeout:=0.5')
+    health = bench.listen('/diagnostics', DiagnosticArray)
+    bench.until(lambda: any('sends sensor_msgs/msg/CompressedImage, see the parameter image_transport'
+                            in status.message for message in health for status in message.status), 'the reason', START)

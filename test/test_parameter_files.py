@@ -23,8 +23,16 @@ def test_sections_of_nodes_and_namespaces_are_found_and_unknown_names_told(tmp_p
     assert read_parameter_file(path) == ({'T1': 50}, ['use_sim_time'])
 
 
+def test_nested_names_are_joined_by_points(tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/**: {ros__parameters: {camera: {fps: 30, size: {width: 640}}, T1: 9.0}}')
+    assert read_parameter_file(path) == ({'T1': 9.0}, ['camera.fps', 'camera.size.width'])
+
+
 @pytest.mark.parametrize(('text', 'reason'), [
-    ('T1: 5', 'no ros__parameters'), ('', 'no ros__parameters'), ('[1, 2]', 'no ros__parameters'),
+    ('a: &a {ros__parameters: {}, b: *a}\nc: &c {d: *c}', 'contains itself'),
+    ('a: {ros__parameters: {day: 2024-13-45}}', 'not YAML'), ('T1: 5', 'no ros__parameters'),
+    ('', 'no ros__parameters'), ('[1, 2]', 'no ros__parameters'),
     ('a: {ros__parameters: 5}', 'must be names with values, got 5'), ('a: [', 'not YAML'), ('\xff\x00', 'not YAML')])
 def test_what_is_no_parameter_file_is_a_sentence(tmp_path, text, reason):
     path = tmp_path / 'some.yaml'
