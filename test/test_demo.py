@@ -10,7 +10,7 @@ from line_feature_node.cli import app
 
 def test_every_frame_of_the_drive_comes_back_with_what_is_true(tmp_path):
     arguments = ['demo', '--frames', '8', '--T1', '7', '--out', str(tmp_path)]
-    result = CliRunner().invoke(app, arguments, env={'COLUMNS': '120'})
+    result = CliRunner().invoke(app, arguments, env={'COLUMNS': '200'})
     assert result.exit_code == 0, result.output
     cells = dict(re.findall(r'│ (.*?) +│ +(.*?) │', result.output))
     assert cells['images published, 30 a second'] == cells['answered with segments'] == '8'
