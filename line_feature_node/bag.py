@@ -5,12 +5,14 @@ was killed can go on. The target is there when all of it is, by a rename.
 """
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import heapq
 import json
 import os
 import shutil
+import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
@@ -43,6 +45,8 @@ VERSION: Literal[9] = 9
 NO_IMAGES = 'no images to be processed'
 #: What definitions that are wrong or missing raise: the parser, the table of types, and their use.
 UNKNOWN_TYPES = (AssertionError, KeyError, TypesysError, ValueError)
+#: How a rename says that something is there, be it a folder with something in it or a file.
+TAKEN = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
 
 class TargetError(OSError):
@@ -120,17 +124,20 @@ def process_recording(
         TargetError: The target exists, or cannot be written.
         WorkersError: The workers die.
     """
-    here, there = source.resolve(), target.resolve()
+    # A target that is a link stays one: what it leads to is made.
+    here, there = Path(os.path.realpath(source)), Path(os.path.realpath(target))
     if here == there or here in there.parents or there in here.parents:
         raise TargetError(f'{target} is the recording itself, or one of the two is in the other')
-    if target.exists() and not run.overwrite:
+    if there in (Path.cwd(), *Path.cwd().parents):
+        raise TargetError(f'{target} is the folder that this is started in, or above it: name a new one')
+    if there.exists() and not run.overwrite:
         raise TargetError(f'{target} exists: --overwrite replaces it')
     slices = plan(source, topics=list(run.topics), start=run.start, end=run.end, every=run.every)
     outcome = Outcome(source, target)
     if not slices:
         outcome.error = NO_IMAGES
         return outcome
-    with _told(target), _Work(source, target, run, slices) as work:
+    with _told(target), _Work(source, there, run, slices) as work:
         for number, data in enumerate(work.results(workers)):
             for frame in work.write(number, unpack(data), outcome):
                 watch(number, len(slices), frame)
@@ -142,13 +149,15 @@ def process_recording(
 
 @contextlib.contextmanager
 def _told(target: Path) -> Iterator[None]:
-    """Make a sentence of what the file system says."""
+    """Make a sentence of what the file system says, and SQLite where it writes."""
     try:
         yield
     except (TargetError, RecordingError):
         raise
     except OSError as error:
         raise TargetError(f'cannot write {target}: {error.strerror or error}') from error
+    except sqlite3.Error as error:
+        raise TargetError(f'cannot write {target}: {error}') from error
 
 
 class _Work:
@@ -160,6 +169,7 @@ class _Work:
         self._slices = slices
         self._folder = target.with_name(f'{target.name}.partial')
         self._journal = self._folder / 'slices'
+        self._replaced = self._folder / 'replaced'
         self._bag = self._folder / 'bag' / target.name  # the file in it has the name of its folder
         self._lock = -1
         self._writer: Any = None
@@ -172,25 +182,29 @@ class _Work:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._lock = os.open(self._folder / 'lock', os.O_CREAT | os.O_RDWR)
         try:
-            try:
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise TargetError(f'another run is writing {self._target}') from None
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._lock)
+            raise TargetError(f'another run is writing {self._target}') from None
+        try:
             self._begin()
         except BaseException:
-            os.close(self._lock)
+            self._clear_up()
             raise
         return self
 
     def _begin(self) -> None:
         described = json.dumps(self._description(), default=str, sort_keys=True)
         record = self._folder / 'run.json'
+        self._settle()
+        if self._target.exists() and not self._run.overwrite:
+            raise TargetError(f'{self._target} exists: --overwrite replaces it')
         if self._run.resume and record.exists() and record.read_text() != described:
             raise TargetError(f'{self._folder} is of a run with other settings or another recording: remove it, '
                               f'or run without --resume')
-        if not self._run.resume:
-            shutil.rmtree(self._journal, ignore_errors=True)
-        shutil.rmtree(self._bag.parent, ignore_errors=True)
+        for old in (self._bag.parent, *(() if self._run.resume else (self._journal,))):
+            with contextlib.suppress(FileNotFoundError):
+                shutil.rmtree(old)
         self._journal.mkdir(exist_ok=True)
         _write_whole(record, described.encode())
         self._writer = Writer(self._bag, version=VERSION,
@@ -268,29 +282,60 @@ class _Work:
             self._csv.writelines(f'{head}{line}\n' for line in frame.messages[CSV].decode().split('\n'))
 
     def finish(self) -> None:
-        """Make the target of what was written, by a rename, and clear up."""
-        bag = self._bag
-        writer, self._writer = self._writer, None
-        writer.close()
+        """Make the target of what was written, by a rename, and clear up.
+
+        Raises:
+            TargetError: A target came up meanwhile, which is not to be replaced.
+        """
+        self._writer.close()
+        self._writer = None
         self._stack.close()
         if self._csv is not None:
-            (self._folder / 'segments.csv').rename(bag / 'segments.csv')
-        if self._target.exists():
-            old = self._folder / 'replaced'
-            self._target.rename(old)
-            bag.rename(self._target)
-        else:
-            bag.rename(self._target)
-        shutil.rmtree(self._folder)
+            (self._folder / 'segments.csv').rename(self._bag / 'segments.csv')
+        for file in self._bag.iterdir():
+            _sync(file)
+        self._put_in_place()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
-    def __exit__(self, kind: Any, *_: Any) -> None:
+    def _put_in_place(self) -> None:
+        came_up = (f'{self._target} came up during the run and stays as it is: --resume with --overwrite replaces it '
+                   f'without doing the work again')
+        if self._run.overwrite:
+            with contextlib.suppress(FileNotFoundError):
+                self._target.rename(self._replaced)
+        elif self._target.exists():
+            raise TargetError(came_up)
+        try:
+            self._bag.rename(self._target)
+        except OSError as error:  # what came up in this very moment is not replaced either, but for an empty folder
+            if error.errno in TAKEN:
+                raise TargetError(came_up) from None
+            raise
+
+    def _settle(self) -> None:
+        """Put back the old target where no new one came in its place; where one did, the old one is done with."""
+        if not self._replaced.exists():
+            return
+        if not self._target.exists():
+            self._replaced.rename(self._target)
+        elif self._replaced.is_dir():
+            shutil.rmtree(self._replaced)
+        else:
+            self._replaced.unlink()
+
+    def __exit__(self, *_: object) -> None:
+        self._clear_up()
+
+    def _clear_up(self) -> None:
         """Leave the journal for a later run where this one did not finish, and nothing else."""
         with contextlib.suppress(Exception):
             self._stack.close()
         if self._writer is not None:
             with contextlib.suppress(Exception):
                 self._writer.abort()
-            shutil.rmtree(self._bag.parent, ignore_errors=True)
+        shutil.rmtree(self._bag.parent, ignore_errors=True)
+        with contextlib.suppress(OSError):  # then the next run does it
+            self._settle()
         os.close(self._lock)
 
 
@@ -351,8 +396,12 @@ class _Copier:
 def _write_whole(path: Path, data: bytes) -> None:
     """Write a file that is whole when it is there, even if the machine is switched off."""
     beside = path.with_name(f'{path.name}.new')
-    with beside.open('wb') as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    beside.write_bytes(data)
+    _sync(beside)
     beside.rename(path)
+
+
+def _sync(path: Path) -> None:
+    """Have a file on the disk; some file systems say only now that there is no room for it."""
+    with path.open('rb') as file:
+        os.fsync(file.fileno())

@@ -5,12 +5,14 @@ that runs tests has a domain of its own.
 """
 
 import fcntl
+import logging
 import os
 import sys
 import tempfile
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -57,3 +59,39 @@ def bench(capfd):
     bench = Bench(capfd)
     yield bench
     bench.close()
+
+
+@pytest.fixture
+def distributed(monkeypatch):
+    """The library Dask; its clients do not wait as long for a scheduler that is not there."""
+    distributed = pytest.importorskip('distributed')
+    clients = []
+
+    def client(address, timeout):
+        clients.append(make(address, timeout='1s' if address.endswith(':9') else '3s'))
+        return clients[-1]
+
+    make = distributed.Client
+    monkeypatch.setattr(distributed, 'Client', client)
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    yield SimpleNamespace(LocalCluster=distributed.LocalCluster, clients=clients)
+    for client in clients:
+        client.close(timeout=1)
+
+
+@pytest.fixture
+def fleet(distributed):
+    """Makes Dask clusters of so many worker processes."""
+    from test_workers import Fleet
+
+    fleets = []
+
+    def fleet(count):
+        fleets.append(Fleet(distributed, count))
+        return fleets[-1]
+
+    yield fleet
+    for client in distributed.clients:
+        client.close(timeout=1)
+    for one in fleets:
+        one.close()

@@ -1,16 +1,28 @@
+import contextlib
 import json
+import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
+from test_recordings import BEGIN, IMAGE, ROS1, ROS2, TEXT, film, image, picture, stamp_of, text, write, write_ros1
+from test_slices import CLOUD, cloud, found
+from test_workers import alive, until
 from typer.testing import CliRunner
 
 from line_feature_node.cli import app
+from line_feature_node.core import LineFeatureExtractor, Parameters
+from line_feature_node.messages import segments_of
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
+CONFIG = Path(__file__).resolve().parents[1] / 'config'
 
 
 def run(*arguments):
@@ -102,3 +114,356 @@ def test_a_page_tells_of_recordings_that_cannot_be_read(tmp_path):
     result = run(tmp_path / 'empty.bag', '--out', tmp_path / 'out', '--report', tmp_path / 'report.html')
     assert result.exit_code == 2
     assert 'the file is empty' in (tmp_path / 'report.html').read_text(encoding='utf-8')
+
+
+# Recordings that the tests write
+
+class Command:
+    """The command as a process, with process group of its own, as a terminal starts it."""
+
+    def __init__(self, *arguments):
+        self.process = subprocess.Popen(
+            [sys.executable, '-c', 'from line_feature_node.cli import main; main()', 'bag', *map(str, arguments)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+    def end(self, number):
+        """Status and standard error after a signal to the whole group."""
+        os.killpg(self.process.pid, number)
+        errors = self.process.communicate(timeout=60)[1]
+        return self.process.returncode, errors
+
+
+def until_there(path, command):
+    until(lambda: path.exists() or command.process.poll() is not None, str(path))
+    assert command.process.poll() is None, command.process.communicate()
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write(tmp_path / 'rec', film(10))
+
+
+@pytest.fixture(scope='module')
+def long(tmp_path_factory):
+    """A recording that takes a while."""
+    data = bytes(ROS2.serialize_cdr(image(picture()), IMAGE))
+    entries = [('/camera', IMAGE, stamp_of(number), data) for number in range(3000)]
+    return write(tmp_path_factory.mktemp('long') / 'rec', entries)
+
+
+def count_of(path):
+    with AnyReader([path]) as reader:
+        return {connection.topic: connection.msgcount for connection in reader.connections}
+
+
+def one_line(result):
+    """Standard error, one line without a traceback."""
+    assert result.stdout == ''
+    [line] = result.stderr.splitlines()
+    assert 'Traceback' not in line
+    return line
+
+
+def usage(result):
+    """The last line of standard error where options are wrong."""
+    assert result.exit_code == 2
+    assert isinstance(result.exception, SystemExit)
+    return result.stderr.splitlines()[-1]
+
+
+def test_one_recording_becomes_the_bag_that_is_named(recording, tmp_path):
+    result = run(recording, '--out', tmp_path / 'out')
+    assert (result.exit_code, result.stderr) == (0, '')
+    assert count_of(tmp_path / 'out') == dict.fromkeys(('/camera/segments', '/camera/markers', '/camera/overlay'), 10)
+    assert '10' in result.stdout
+    assert 'written to' in result.stdout
+
+
+@pytest.mark.xfail(strict=True, reason='the table cuts paths off')
+def test_the_table_has_the_whole_path_of_the_new_bag(recording, tmp_path):
+    target = tmp_path / ('a-long-name-' * 8) / ('and-another-' * 8)
+    assert str(target) in run(recording, '--out', target).stdout.replace('\n', '')
+
+
+def test_all_options_reach_the_run(tmp_path):
+    entries = sorted([*film(20, '/left'), *film(20, '/right', offset=7), ('/words', TEXT, BEGIN, text('a'))],
+                     key=lambda entry: entry[2])
+    path = write(tmp_path / 'rec', entries)
+    result = run(path, '--out', tmp_path / 'out', '--topic', '/left', '--start', 0.05, '--end', 0.15, '--every', 2,
+                 '--storage', 'sqlite3', '--csv', '--only-segments', '--workers', 1, '--copy', '--json')
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / 'out' / 'out.db3').exists()
+    assert (tmp_path / 'out' / 'segments.csv').exists()
+    assert count_of(tmp_path / 'out') == {'/left': 10, '/right': 10, '/words': 0, '/left/segments': 5}
+
+
+def test_two_topics_are_named_one_by_one(tmp_path):
+    path = write(tmp_path / 'rec', [*film(3, '/a'), *film(3, '/b'), *film(3, '/c')])
+    assert run(path, '--out', tmp_path / 'out', '--topic', '/a', '--topic', '/c', '--only-segments').exit_code == 0
+    assert set(count_of(tmp_path / 'out')) == {'/a/segments', '/c/segments'}
+
+
+def test_json_is_one_line_and_nothing_else(recording, tmp_path):
+    result = run(recording, '--out', tmp_path / 'out', '--json')
+    assert result.stderr == ''
+    assert result.stdout.count('\n') == 1
+    [summary] = json.loads(result.stdout)['recordings']
+    assert summary == {'source': str(recording), 'target': str(tmp_path / 'out'), 'error': '', 'frames': 10,
+                       'failed': {}, 'segments': sum(len(found(picture(number))) for number in range(10))}
+
+
+def test_json_says_what_failed(tmp_path):
+    entries = film(4)
+    entries[1] = (*entries[1][:3], image(picture(), step=3))
+    (tmp_path / 'in').mkdir()
+    write(tmp_path / 'in' / 'rec', entries)
+    (tmp_path / 'in' / 'bad.bag').write_bytes(b'noise')
+    result = run(tmp_path / 'in', '--out', tmp_path / 'out', '--json')
+    assert result.exit_code == 1
+    bad, good = json.loads(result.stdout)['recordings']
+    assert 'cannot be read' in bad['error']
+    assert (good['frames'], sum(good['failed'].values()), good['error']) == (4, 1, '')
+    assert len(result.stderr.splitlines()) == 2
+
+
+def strict(data):
+    """JSON without what only Python takes for it."""
+    def refuse(constant):
+        raise ValueError(constant)
+
+    return json.loads(data, parse_constant=refuse)
+
+
+@pytest.mark.xfail(strict=True, reason='NaN in the JSON and a RuntimeWarning of numpy where nothing was found')
+def test_json_without_any_agreement_is_json(tmp_path):
+    truth = ('/camera/truth', CLOUD, BEGIN, cloud(found(picture())))
+    path = write(tmp_path / 'rec', [('/camera', IMAGE, BEGIN, image(np.full((48, 64), 90, np.uint8))), truth])
+    result = run(path, '--out', tmp_path / 'out', '--truth', '--json')
+    assert result.stderr == ''
+    assert strict(result.stdout)['recordings'][0]['truth']['recall'] == 0
+
+
+def test_quiet_is_silent_unless_something_is_wrong(tmp_path):
+    entries = film(4)
+    entries[1] = (*entries[1][:3], image(picture(), step=3))
+    result = run(write(tmp_path / 'rec', entries), '--out', tmp_path / 'out', '--quiet')
+    assert result.exit_code == 1
+    assert 'rec: 1 frames failed: step is 3' in one_line(result)
+
+
+def test_a_recording_without_images_is_status_0_with_a_sentence(tmp_path):
+    path = write(tmp_path / 'rec', [('/words', TEXT, BEGIN, text('a'))])
+    result = run(path, '--out', tmp_path / 'out')
+    assert result.exit_code == 0
+    assert one_line(result) == f'{path}: no images to be processed'
+    assert not (tmp_path / 'out').exists()
+
+
+def test_status_2_when_every_frame_fails(tmp_path):
+    path = write(tmp_path / 'rec', [(*entry[:3], image(picture(), encoding='mono12')) for entry in film(3)])
+    result = run(path, '--out', tmp_path / 'out')
+    assert result.exit_code == 2
+    assert 'rec: 3 frames failed: unknown encoding' in result.stderr
+    assert 'Traceback' not in result.output
+
+
+def test_status_2_when_nothing_is_there(tmp_path):
+    (tmp_path / 'folder').mkdir()
+    for name in ('missing', 'folder'):
+        result = run(tmp_path / name, '--out', tmp_path / 'out')
+        assert result.exit_code == 2
+        assert str(tmp_path / name) in one_line(result)
+
+
+def test_a_target_that_exists_is_refused_and_replaced_on_request(recording, tmp_path):
+    (tmp_path / 'out').mkdir()
+    (tmp_path / 'out' / 'old.txt').touch()
+    result = run(recording, '--out', tmp_path / 'out')
+    assert result.exit_code == 2
+    assert f'{tmp_path}/out exists: --overwrite replaces it' in one_line(result)
+    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['old.txt']
+    assert run(recording, '--out', tmp_path / 'out', '--overwrite').exit_code == 0
+    assert count_of(tmp_path / 'out')['/camera/segments'] == 10
+
+
+def test_a_place_that_cannot_be_written_to_is_a_sentence(recording, tmp_path):
+    (tmp_path / 'file').touch()
+    result = run(recording, '--out', tmp_path / 'file' / 'out')
+    assert result.exit_code == 2
+    assert 'cannot write' in one_line(result)
+
+
+def test_names_that_come_twice_are_numbered(tmp_path):
+    for folder, count in (('a', 3), ('b', 4)):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / 'rec', film(count))
+    write_ros1(tmp_path / 'b' / 'rec.bag', film(5, types=ROS1))
+    result = run(tmp_path / 'a', tmp_path / 'b', '--out', tmp_path / 'out', '--only-segments')
+    assert result.exit_code == 0, result.output
+    counts = {path.name: count_of(path)['/camera/segments'] for path in (tmp_path / 'out').iterdir()}
+    assert counts == {'rec': 3, 'rec-2': 4, 'rec-3': 5}
+
+
+@pytest.mark.xfail(strict=True, reason='rec-2 is the name of the second rec and of a recording of that name')
+def test_names_with_numbers_do_not_meet_others(tmp_path):
+    for place in ('a/rec', 'b/rec', 'c/rec-2'):
+        (tmp_path / place).parent.mkdir()
+        write(tmp_path / place, film(3))
+    result = run(*(tmp_path / folder for folder in 'abc'), '--out', tmp_path / 'out', '--only-segments')
+    assert result.exit_code == 0, result.output
+    assert len(list((tmp_path / 'out').iterdir())) == 3
+
+
+@pytest.mark.parametrize(('arguments', 'sentence'), [
+    (['--storage', 'tape'], 'storage must be mcap or sqlite3'), (['--every', 0], '--every'),
+    (['--workers', 0], '--workers'), (['--start', -1], '--start'), (['--start', 'nan'], '--start'),
+    (['--start', 'soon'], '--start'),
+    (['--T1', 2], 'T2 must be less than T1'), (['--profile', 'fast'], 'profile must be one of'),
+    (['--params-file', 'missing.yaml'], 'missing.yaml: No such file'), (['--nonsense'], 'No such option')])
+def test_options_that_make_no_sense_are_a_sentence(recording, tmp_path, arguments, sentence):
+    assert sentence in usage(run(recording, '--out', tmp_path / 'out', *arguments))
+    assert [path.name for path in tmp_path.iterdir()] == ['rec']
+
+
+def test_a_mask_that_cannot_be_read_is_a_sentence(recording, tmp_path):
+    result = run(recording, '--out', tmp_path / 'out', '--mask-file', tmp_path / 'none.png')
+    assert result.exit_code == 2
+    assert 'none.png: No such file' in one_line(result)
+
+
+def test_the_mask_hides_edges(recording, tmp_path):
+    cv2.imwrite(str(tmp_path / 'mask.png'), np.zeros((48, 64), np.uint8))
+    result = run(recording, '--out', tmp_path / 'out', '--mask-file', tmp_path / 'mask.png', '--json')
+    assert json.loads(result.stdout)['recordings'][0]['segments'] == 0
+
+
+@pytest.mark.parametrize('option', [('--end', 'inf'), ('--start', '1e300')])
+def test_times_beyond_all_measure_are_a_sentence(recording, tmp_path, option):
+    result = run(recording, '--out', tmp_path / 'out', *option)
+    assert len(result.stderr.splitlines()) <= 1
+    assert 'Traceback' not in result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+
+
+def test_the_folder_one_is_in_is_refused_as_target(recording, tmp_path, monkeypatch):
+    (tmp_path / 'here').mkdir()
+    monkeypatch.chdir(tmp_path / 'here')
+    result = run(recording, '--out', '.', '--overwrite')
+    assert result.exit_code == 2
+    assert one_line(result) == f'{recording}: . is the folder that this is started in, or above it: name a new one'
+
+
+def segments_in(path):
+    with AnyReader([path]) as reader:
+        return [segments_of(reader.deserialize(data, CLOUD)) for connection, _, data in reader.messages()
+                if connection.topic.endswith('/segments')]
+
+
+def test_the_file_of_a_node_is_accepted_as_it_is(recording, tmp_path):
+    result = run(recording, '--out', tmp_path / 'out', '--params-file', CONFIG / 'corridor.yaml')
+    assert (result.exit_code, result.stderr) == (0, '')
+    extractor = LineFeatureExtractor(Parameters.profile('corridor'))
+    for number, segments in enumerate(segments_in(tmp_path / 'out')):
+        assert segments.tobytes() == extractor.extract(picture(number)).tobytes()
+
+
+def test_options_win_over_the_file_and_unknown_names_are_warned_of(recording, tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/front/**: {ros__parameters: {profile: paper, T1: 20, T2: 9, lazy: false, T3: 4}}')
+    result = run(recording, '--out', tmp_path / 'out', '--params-file', path, '--T2', 4)
+    assert result.exit_code == 0
+    assert one_line_of_errors(result) == f"{path}: there is no parameter 'T3', what it is set to has no effect"
+    extractor = LineFeatureExtractor(Parameters.profile('paper', T1=20.0, T2=4.0))
+    for number, segments in enumerate(segments_in(tmp_path / 'out')):
+        assert segments.tobytes() == extractor.extract(picture(number)).tobytes()
+
+
+def one_line_of_errors(result):
+    [line] = result.stderr.splitlines()
+    return line
+
+
+@pytest.mark.xfail(strict=True, reason='mask_file and jpeg_quality of the file are dropped without a word')
+def test_what_the_file_says_of_the_mask_holds_here_too(recording, tmp_path):
+    cv2.imwrite(str(tmp_path / 'mask.png'), np.zeros((48, 64), np.uint8))
+    path = tmp_path / 'some.yaml'
+    path.write_text(f'/**: {{ros__parameters: {{mask_file: {tmp_path}/mask.png}}}}')
+    result = run(recording, '--out', tmp_path / 'out', '--params-file', path, '--json')
+    assert json.loads(result.stdout)['recordings'][0]['segments'] == 0
+
+
+# A full disk
+
+#: Mounts a file system of a size at a folder, for a command and what it starts, and lists what is left in it.
+SMALL = 'mount -t tmpfs -o size="$0" none "$1" && cd "$1" && shift && "$@"; status=$?; ls; exit $status'
+
+
+def on_small_disk(size, folder, *command):
+    """Run a command in a folder that is a file system of that size, which nobody else sees."""
+    folder.mkdir(exist_ok=True)
+    return subprocess.run(['unshare', '-rm', 'sh', '-c', SMALL, size, folder, *map(str, command)],
+                          check=False, capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    if not shutil.which('unshare') or on_small_disk('64k', tmp_path / 'disk', 'true').returncode:
+        pytest.skip('no file system can be mounted here')
+    return tmp_path / 'disk'
+
+
+@pytest.mark.parametrize('size', ['16k', '300k', '700k', '800k'])
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_disk_that_is_really_full_is_one_line_and_no_target(small_disk, tmp_path, storage, size):
+    path = write(tmp_path / 'rec', film(200))
+    code = 'from line_feature_node.cli import main; main()'
+    result = on_small_disk(size, small_disk, sys.executable, '-c', code, 'bag', path, '--out', 'out', '--copy',
+                           '--storage', storage, '--workers', 1)
+    assert result.returncode == 2
+    [line] = result.stderr.splitlines()
+    assert line.startswith(f'{path}: cannot write out: ')
+    assert line.endswith(('No space left on device', 'database or disk is full'))
+    assert result.stdout.splitlines() == ['out.partial']
+
+
+# Signals
+
+def children_of(pid):
+    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
+
+
+def command_of(pid):
+    with contextlib.suppress(OSError):
+        return Path(f'/proc/{pid}/cmdline').read_bytes()
+    return b''
+
+
+@pytest.mark.parametrize(('number', 'status'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_in_the_midst_end_cleanly_and_the_run_can_be_gone_on_with(long, tmp_path, number, status):
+    command = Command(long, '--out', tmp_path / 'out', '--only-segments', '--workers', 1)
+    until_there(tmp_path / 'out.partial' / 'slices' / '000002', command)
+    children = children_of(command.process.pid)
+    if number == signal.SIGTERM:
+        command.process.send_signal(number)
+        errors = command.process.communicate(timeout=60)[1]
+    else:
+        _, errors = command.end(number)
+    assert command.process.returncode == status
+    assert errors == f'{number.name}: ended before all was done; --resume goes on from there\n'
+    assert [path.name for path in tmp_path.iterdir()] == ['out.partial']
+    assert children
+    until(lambda: not any(map(alive, children)), 'end of the workers', 5)
+    done = len(list((tmp_path / 'out.partial' / 'slices').iterdir()))
+    assert 3 <= done < 94
+    assert run(long, '--out', tmp_path / 'out', '--only-segments', '--resume', '--quiet', '--workers', 1).exit_code == 0
+    assert count_of(tmp_path / 'out') == {'/camera/segments': 3000}
+
+
+@pytest.mark.xfail(strict=False, reason='workers that are just starting die of an interrupt with a traceback each')
+def test_an_interrupt_while_workers_start_is_one_line(long, tmp_path):
+    command = Command(long, '--out', tmp_path / 'out', '--only-segments', '--workers', 2)
+    until(lambda: b'spawn_main' in b''.join(map(command_of, children_of(command.process.pid))), 'a worker')
+    time.sleep(0.15)
+    status, errors = command.end(signal.SIGINT)
+    assert status == 130
+    assert 'Traceback' not in errors

@@ -74,3 +74,38 @@ def test_what_cannot_be_is_a_sentence_and_status_2(run, arguments):
     assert result.exit_code == 2
     assert parameters is None
     assert 'Traceback' not in result.output
+
+
+def test_whole_numbers_of_a_file_are_taken_for_doubles(run, tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/**: {ros__parameters: {T1: 30, min_length: 12, roi: [0, 0, 1, 1], n: 6}}')
+    parameters = run('--params-file', path)[1]
+    assert (parameters.T1, parameters.min_length, parameters.roi, parameters.n) == (30.0, 12.0, (0.0, 0.0, 1.0, 1.0), 6)
+    assert isinstance(parameters.T1, float)
+
+
+def test_the_profile_of_the_command_wins_over_that_of_the_file_which_still_sets_what_it_names(run, tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/**: {ros__parameters: {profile: corridor, T1: 30.0}}')
+    assert run('--params-file', path, '--profile', 'paper')[1] == Parameters.profile('paper', T1=30.0)
+
+
+@pytest.mark.parametrize(('name', 'value'), [('profile', 'none'), ('T1', 'many'), ('T1', -5), ('profile', '[1]'),
+                                             ('roi', '[1, 2]'), ('operator', 3)])
+def test_values_of_a_file_that_cannot_be_are_a_sentence_with_their_name(run, tmp_path, name, value):
+    path = tmp_path / 'some.yaml'
+    path.write_text(f'/**: {{ros__parameters: {{{name}: {value}}}}}')
+    result, parameters = run('--params-file', path)
+    assert result.exit_code == 2
+    assert parameters is None
+    assert name in result.stderr
+    assert 'Traceback' not in result.output
+
+
+def test_each_warning_is_one_line(run, tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/**: {ros__parameters: {one: 1, two: 2, T1: 9.0}}')
+    result, parameters = run('--params-file', path)
+    assert result.exit_code == 0
+    assert len(result.stderr.splitlines()) == 2
+    assert parameters.T1 == 9

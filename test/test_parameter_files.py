@@ -1,8 +1,10 @@
 from pathlib import Path
 
 import pytest
+import yaml
 
 from line_feature_node.core import Parameters
+from line_feature_node.options import Options
 from line_feature_node.parameter_files import read_parameter_file
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
@@ -46,3 +48,31 @@ def test_what_is_no_parameter_file_is_a_sentence(tmp_path, text, reason):
 def test_a_missing_file_is_a_sentence(tmp_path):
     with pytest.raises(ValueError, match='none.yaml: No such file'):
         read_parameter_file(tmp_path / 'none.yaml')
+
+
+def test_sections_are_put_together_and_the_last_wins(tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/**: {ros__parameters: {T1: 5, n: 3}}\nfront: {node: {ros__parameters: {T1: 7.5, lazy: true}}}\n')
+    assert read_parameter_file(path) == ({'T1': 7.5, 'n': 3, 'lazy': True}, [])
+
+
+def test_parameters_and_options_of_every_name_are_known(tmp_path):
+    path = tmp_path / 'some.yaml'
+    names = [*Parameters.specs(), *Options.specs()]
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': dict.fromkeys([*names, 'other', 5], 1)}}))
+    values, unknown = read_parameter_file(path)
+    assert set(values) == set(names)
+    assert sorted(unknown) == ['5', 'other']
+
+
+def test_a_folder_is_a_sentence(tmp_path):
+    with pytest.raises(ValueError, match='Is a directory'):
+        read_parameter_file(tmp_path)
+
+
+@pytest.mark.xfail(strict=True, reason='RecursionError where a mapping has itself in it', raises=RecursionError)
+def test_a_mapping_that_has_itself_in_it_is_a_sentence(tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('a: &a\n  b: *a\n')
+    with pytest.raises(ValueError, match='no ros__parameters'):
+        read_parameter_file(path)

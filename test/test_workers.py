@@ -1,5 +1,9 @@
 """Workers that are processes of this machine, or of a Dask cluster, and what becomes of the work when they die."""
 
+import contextlib
+import importlib
+import json
+import logging
 import os
 import signal
 import subprocess
@@ -7,12 +11,11 @@ import sys
 import threading
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from line_feature_node import workers as workers_module
 from line_feature_node.workers import ATTEMPTS, Workers, WorkersError, cluster, in_order, inline, local
 
 #: Seconds after which something that a test waits for will not come any more.
@@ -239,13 +242,29 @@ def test_attempts_are_counted_anew_when_something_was_done():
             return future
 
     def broken():
-        raise workers_module.BrokenExecutor
+        raise BrokenExecutor
 
     found = []
     for result in in_order(Workers(1, lambda: Dying(1)), double, pieces(10)):
         found.append(result)
         left.pop(0)
     assert found == doubles(10)
+
+
+@pytest.mark.parametrize('last', [2, 3, 5, 9])
+def test_no_result_is_lost_when_workers_are_found_dead_as_work_is_given_out(last):
+    calls = []
+
+    class Dead(ThreadPoolExecutor):
+        """Takes so many pieces of work and no more, once."""
+
+        def submit(self, work, *arguments):
+            calls.append(arguments)
+            if len(calls) == last + 1:
+                raise BrokenExecutor
+            return super().submit(work, *arguments)
+
+    assert list(in_order(Workers(1, lambda: Dead(1)), double, pieces(12))) == doubles(12)
 
 
 def run(folder, code):
@@ -280,3 +299,123 @@ def test_without_dask_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, 'distributed', None)
     with pytest.raises(WorkersError, match='fleet'):
         cluster('tcp://127.0.0.1:8786')
+
+
+@pytest.mark.filterwarnings('default')
+@pytest.mark.parametrize('address', ['tcp://127.0.0.1:9', '127.0.0.1:9', 'http://127.0.0.1:9', 'udp://x:9'])
+def test_an_address_without_a_scheduler_is_a_sentence(distributed, address):
+    with pytest.raises(WorkersError) as error:
+        cluster(address)
+    assert address in str(error.value)
+    assert '\n' not in str(error.value)
+
+
+class Fleet:
+    """A scheduler in this process, and workers that are processes of their own; nobody starts them anew."""
+
+    def __init__(self, distributed, count):
+        self._cluster = distributed.LocalCluster(
+            n_workers=0, threads_per_worker=1, processes=True, dashboard_address=':0', silence_logs=logging.CRITICAL)
+        self.address = self._cluster.scheduler_address
+        self.workers = [subprocess.Popen(
+            [sys.executable, '-m', 'distributed.cli.dask_worker', self.address, '--nthreads', '1', '--no-nanny',
+             '--no-dashboard'],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=ENVIRONMENT) for _ in range(count)]
+        until(lambda: len(self._cluster.scheduler_info['workers']) == count, 'workers of Dask')
+
+    def close(self):
+        for worker in self.workers:
+            worker.kill()
+            worker.wait()
+        self._cluster.close()
+
+
+def test_a_cluster_does_the_work_in_order(fleet):
+    fleet = fleet(2)
+    crew = cluster(fleet.address)
+    assert crew.count == 2
+    assert list(in_order(crew, slow_first, pieces(20))) == doubles(20)
+    assert set(in_order(crew, who, pieces(20))) <= {str(worker.pid).encode() for worker in fleet.workers}
+
+
+def test_an_exception_in_a_cluster_passes_through(fleet):
+    results = in_order(cluster(fleet(1).address), fail, pieces(9))
+    assert [next(results) for _ in range(3)] == doubles(3)
+    with pytest.raises(KeyError, match='the work itself'):
+        next(results)
+
+
+def test_a_cluster_that_loses_a_worker_has_the_same_results(fleet, tmp_path):
+    fleet = fleet(2)
+    results = in_order(cluster(fleet.address), mark_and_double, pieces(100, tmp_path))
+    found = [next(results) for _ in range(10)]
+    assert len(processes(tmp_path)) == 2
+    fleet.workers[0].kill()
+    found += results
+    assert found == doubles(100)
+    assert sum(count > 1 for count in times(tmp_path).values()) <= 4
+
+
+def exhaust(results, errors):
+    try:
+        list(results)
+    except Exception as error:  # noqa: BLE001, what comes is the question
+        errors.append(error)
+
+
+def error_of(results):
+    """What the results end with; waited for by another thread, lest results that never end hold up the tests."""
+    errors = []
+    threading.Thread(target=exhaust, args=(results, errors), daemon=True).start()
+    until(lambda: errors, 'error', 5)
+    assert isinstance(errors[0], WorkersError), repr(errors[0])
+    assert '\n' not in str(errors[0])
+
+
+def test_a_cluster_whose_workers_die_each_time_is_an_error(fleet, tmp_path):
+    config = importlib.import_module('dask').config
+    with config.set({'distributed.scheduler.allowed-failures': 0}):
+        crew = cluster(fleet(ATTEMPTS + 1).address)
+    results = in_order(crew, die_always, pieces(5, tmp_path))
+    assert [next(results) for _ in range(2)] == doubles(2)
+    error_of(results)
+
+
+@pytest.mark.xfail(strict=True, reason='the run waits for ever when the scheduler of Dask has ended')
+def test_a_cluster_whose_scheduler_ends_is_an_error(distributed, tmp_path):
+    place = tmp_path / 'scheduler.json'
+    (tmp_path / 'marks').mkdir()
+    scheduler, worker = (subprocess.Popen(
+        [sys.executable, '-m', f'distributed.cli.dask_{part}', '--scheduler-file', place, '--no-dashboard', *more],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=ENVIRONMENT, cwd=tmp_path)
+        for part, more in (('scheduler', ('--host', '127.0.0.1', '--port', '0')),
+                           ('worker', ('--nthreads', '1', '--no-nanny'))))
+    try:
+        until(lambda: place.exists() and place.read_text().endswith('}'), 'scheduler')
+        address = json.loads(place.read_text())['address']
+        results = in_order(connected(address), mark_and_double, pieces(1000, tmp_path / 'marks'))
+        next(results)
+        scheduler.kill()
+        error_of(results)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
+
+
+def connected(address):
+    """The cluster, once its worker is there."""
+    crews = []
+
+    def there():
+        with contextlib.suppress(WorkersError):
+            crews.append(cluster(address))
+        return crews
+
+    until(there, 'worker of Dask')
+    return crews[0]
+
+
+def test_a_cluster_without_workers_is_a_sentence(fleet):
+    with pytest.raises(WorkersError, match='has no workers'):
+        cluster(fleet(0).address)
