@@ -14,7 +14,7 @@ import os
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -137,8 +137,9 @@ def process_recording(
     if not slices:
         outcome.error = NO_IMAGES
         return outcome
-    with _told(target), _Work(source, there, run, slices) as work:
-        for number, data in enumerate(work.results(workers)):
+    with (_told(target), _Work(source, there, run, slices) as work,
+          contextlib.closing(work.results(workers)) as results):
+        for number, data in enumerate(results):
             for frame in work.write(number, unpack(data), outcome):
                 watch(number, len(slices), frame)
             watch(number + 1, len(slices), None)
@@ -233,20 +234,21 @@ class _Work:
         return {'files': [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files], 'job': job,
                 'slices': [asdict(part) for part in self._slices]}
 
-    def results(self, workers: Workers) -> Iterator[bytes]:
+    def results(self, workers: Workers) -> Generator[bytes, None, None]:
         """What was made of each slice, in order; what an earlier run made is taken from the journal."""
         paths = [self._journal / f'{number:06d}' for number in range(len(self._slices))]
         missing = [number for number, path in enumerate(paths) if not path.exists()]
         if len(missing) == 1:
             workers = inline()
-        made = in_order(workers, process_slice, [(self._slices[number], self._run.job) for number in missing])
-        for number, path in enumerate(paths):
-            if number not in set(missing):
-                yield path.read_bytes()
-            else:
-                data = next(made)
-                _write_whole(path, data)
-                yield data
+        pieces = [(self._slices[number], self._run.job) for number in missing]
+        with contextlib.closing(in_order(workers, process_slice, pieces)) as made:
+            for path in paths:
+                if path.exists():
+                    yield path.read_bytes()
+                else:
+                    data = next(made)
+                    _write_whole(path, data)
+                    yield data
 
     def write(self, number: int, frames: list[Frame], outcome: Outcome) -> Iterator[Frame]:
         """Write what was made of a slice, and what is copied of its time, in the order of time."""

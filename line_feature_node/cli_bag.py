@@ -151,9 +151,14 @@ def _progress(name: str, *, quiet: bool) -> Iterator[Any]:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Signals end what is under way as an exception does, so that it is cleared up."""
+    """Signals end what is under way as an exception does, so that it is cleared up; from then on they are ignored."""
+    interrupted = False
 
     def interrupt(number: int, _: Any) -> None:
+        nonlocal interrupted
+        interrupted = True
+        for each in INTERRUPTED:
+            signal.signal(each, signal.SIG_IGN)
         raise _Interrupted(number)
 
     before = {number: signal.signal(number, interrupt) for number in INTERRUPTED}
@@ -161,7 +166,8 @@ def _interruptible() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if not interrupted:
+                signal.signal(number, handler)
 
 
 def _status(outcomes: list[Outcome]) -> int:

@@ -1,19 +1,36 @@
 """Who does the work of the offline run: processes of this machine, or a Dask cluster, behind the executor interface."""
 
+import concurrent.futures
 import contextlib
+import importlib.metadata
+import logging
 import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from typing import Any
 
+#: What the workers of a cluster must have, in the same version as here.
+PACKAGE = 'line_feature_node'
 #: How often a piece of work is given out when those who had it died.
 ATTEMPTS = 3
+#: Seconds between looks at who is waited for.
+LOOK = 0.5
+#: Seconds in which a scheduler must answer, ...
+ANSWER = 10.0
+#: ... and one that was lost must be back.
+RETURN = 5.0
+#: What Dask would say on its own, with tracebacks, is said in sentences here.
+LOGGERS = ('distributed', 'distributed.client', 'distributed.comm', 'distributed.core', 'tornado.application')
+#: Seconds in which a cluster whose workers are all gone must have new ones.
+REPLACEMENT = 60.0
 
 
 class WorkersError(RuntimeError):
@@ -28,11 +45,13 @@ class Workers:
         count: How many pieces of work they do at a time.
         make: Makes an executor, a context manager; again when the one before broke.
         broken: Exceptions that say that workers died.
+        look: Called while a result is waited for; raises one of `broken`, or WorkersError, where none is to come.
     """
 
     count: int
     make: Callable[[], 'contextlib.AbstractContextManager[Executor]']
     broken: tuple[type[BaseException], ...] = (BrokenExecutor,)
+    look: Callable[[], None] = lambda: None
 
 
 def local(count: int | None = None) -> Workers:
@@ -43,17 +62,45 @@ def local(count: int | None = None) -> Workers:
 
 @contextlib.contextmanager
 def _pool(count: int) -> Iterator[Executor]:
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context('spawn'), _begin)
+    others = set(multiprocessing.active_children())
+    pool = _Pool(count)
     try:
         yield pool
+    except BaseException:
+        # Nobody wants any more what is under way, which may take long.
+        pool.stop_starting()
+        for process in set(multiprocessing.active_children()) - others:
+            process.kill()
+        raise
     finally:
-        # What was not begun is not done any more; what was is short.
+        pool.stop_starting()
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Pool(ProcessPoolExecutor):
+    """Starts its processes in a thread of its own, which blocks interrupts, as the processes then do from the first.
+
+    No handler of signals runs in that thread either, which would leave a process that is half started.
+    """
+
+    def __init__(self, count: int) -> None:
+        super().__init__(count, multiprocessing.get_context('spawn'), _begin)
+        resource_tracker.ensure_running()  # where it is started, interrupts are let through again
+        self._starter = ThreadPoolExecutor(1, 'starter', signal.pthread_sigmask, (signal.SIG_BLOCK, [signal.SIGINT]))
+
+    def submit(self, work: Any, /, *arguments: Any, **options: Any) -> Any:
+        """As any executor does."""
+        return self._starter.submit(super().submit, work, *arguments, **options).result()
+
+    def stop_starting(self) -> None:
+        """Let the process that is being started be the last."""
+        self._starter.shutdown(wait=True)
 
 
 def _begin() -> None:
     """Let a worker end with its parent, however that ends, and leave signals of the terminal to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
@@ -76,41 +123,96 @@ def cluster(address: str) -> Workers:
         address: Of its scheduler, tcp://host:port.
 
     Raises:
-        WorkersError: Dask is not installed, or nobody answers there.
+        WorkersError: Dask is not installed, nobody answers there, or the workers are none or have another version.
     """
     try:
         from distributed import Client, KilledWorker
         from distributed.comm import CommClosedError
     except ImportError:
         raise WorkersError("Dask is not installed: install the extra 'fleet'") from None
+    for name in LOGGERS:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
-        client = Client(address, timeout='10s')
+        client = Client(address, timeout=ANSWER)
     except (OSError, TimeoutError, ValueError) as error:
         raise WorkersError(f'no Dask scheduler answers at {address}: {error}') from None
-    number = sum(client.nthreads().values())
-    if not number:
-        raise WorkersError(f'the Dask cluster at {address} has no workers')
+    cluster = _Cluster(address, client)
     broken = (BrokenExecutor, CancelledError, CommClosedError, KilledWorker)
-    return Workers(number, lambda: contextlib.closing(_Closable(client)), broken)
+    return Workers(cluster.count(), cluster.executor, broken, cluster.look)
 
 
-class _Closable(Executor):
-    """A client's executor; closing it gives back what was not begun, and leaves the client for the next."""
+class _Cluster:
+    """A Dask cluster that is looked after: what is given to one without scheduler would never be done."""
 
-    def __init__(self, client: Any) -> None:
-        self._executor = client.get_executor(retries=ATTEMPTS, pure=False)
+    def __init__(self, address: str, client: Any) -> None:
+        self._address = address
+        self._client = client
+        self._seen = time.monotonic()
 
-    def submit(self, work: Any, /, *arguments: Any, **options: Any) -> Any:
-        """As any executor does."""
-        return self._executor.submit(work, *arguments, **options)
+    def count(self) -> int:
+        """How many pieces of work are done at a time.
 
-    def close(self) -> None:
-        self._executor.shutdown(wait=False)
+        Raises:
+            WorkersError: There are no workers, or they are no use.
+        """
+        try:
+            versions = set(self._client.run(importlib.metadata.version, PACKAGE).values())
+        except (ImportError, OSError) as error:
+            self._close()
+            raise WorkersError(f'workers of the Dask cluster at {self._address} lack {PACKAGE}: {error}') from None
+        number = sum(self._client.nthreads().values())
+        own = importlib.metadata.version(PACKAGE)
+        if not number or versions != {own}:
+            self._close()
+            raise WorkersError(f'the Dask cluster at {self._address} has no workers' if not number else
+                               f'workers of the Dask cluster at {self._address} have {PACKAGE} '
+                               f'{", ".join(sorted(versions))}, but here it is {own}')
+        return number
+
+    @contextlib.contextmanager
+    def executor(self) -> Iterator[Executor]:
+        """Its executor; what was not begun is given back at the end, the connection stays for the next.
+
+        Raises:
+            WorkersError: The scheduler has not come back.
+        """
+        end = time.monotonic() + RETURN
+        while self._client.status != 'running':
+            if self._client.status == 'closed' or time.monotonic() > end:
+                self._close()
+                raise WorkersError(f'the Dask scheduler at {self._address} does not answer any more')
+            time.sleep(LOOK / 10)
+        self._seen = time.monotonic()
+        executor = self._client.get_executor(pure=False)
+        try:
+            yield executor
+        finally:
+            with contextlib.suppress(Exception):  # there may be nobody any more to give it back to
+                executor.shutdown(wait=False)
+
+    def look(self) -> None:
+        """See that there is a scheduler, and workers.
+
+        Raises:
+            BrokenExecutor: There is no scheduler at present.
+            WorkersError: The workers are gone, and no others came.
+        """
+        if self._client.status != 'running':
+            raise BrokenExecutor
+        if self._client.nthreads():
+            self._seen = time.monotonic()
+        elif time.monotonic() > self._seen + REPLACEMENT:
+            self._close()
+            raise WorkersError(f'the Dask cluster at {self._address} has had no workers for {REPLACEMENT:g} s')
+
+    def _close(self) -> None:
+        with contextlib.suppress(Exception):  # it may have closed itself meanwhile
+            self._client.close(timeout=1)
 
 
 def in_order(
     workers: Workers, work: Callable[..., bytes], pieces: Iterable[tuple[Any, ...]],
-) -> Iterator[bytes]:
+) -> Generator[bytes, None, None]:
     """Results of the work on each piece, in the order of the pieces; only so many at a time as keep the workers busy.
 
     Args:
@@ -127,20 +229,27 @@ def in_order(
     while remaining:
         before = len(remaining)
         with contextlib.suppress(*workers.broken), workers.make() as executor:
-            yield from _results(executor, work, remaining, 2 * workers.count)
+            yield from _results(executor, work, remaining, workers)
         attempts = attempts + 1 if len(remaining) == before else 0
         if attempts == ATTEMPTS:
             raise WorkersError(f'workers were killed {ATTEMPTS} times in a row, perhaps for want of memory')
 
 
 def _results(
-    executor: Executor, work: Callable[..., bytes], remaining: 'deque[tuple[Any, ...]]', ahead: int,
+    executor: Executor, work: Callable[..., bytes], remaining: 'deque[tuple[Any, ...]]', workers: Workers,
 ) -> Iterator[bytes]:
     """Take from what remains piece by piece, as each is done; the others are under way."""
+    ahead = 2 * workers.count
     under_way: deque[Future[bytes]] = deque(executor.submit(work, *piece) for piece in list(remaining)[:ahead])
     while under_way:
-        result = under_way.popleft().result()
+        result = _result(under_way.popleft(), workers)
         remaining.popleft()
         yield result  # before anything that fails when workers died, or it would be lost
         if len(remaining) > len(under_way):
             under_way.append(executor.submit(work, *remaining[len(under_way)]))
+
+
+def _result(future: 'Future[bytes]', workers: Workers) -> bytes:
+    while not concurrent.futures.wait([future], LOOK).done:
+        workers.look()
+    return future.result()

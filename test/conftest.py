@@ -5,14 +5,12 @@ that runs tests has a domain of its own.
 """
 
 import fcntl
-import logging
 import os
 import sys
 import tempfile
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -63,7 +61,7 @@ def bench(capfd):
 
 @pytest.fixture
 def distributed(monkeypatch):
-    """The library Dask; its clients do not wait as long for a scheduler that is not there."""
+    """The library Dask; its clients do not wait as long for a scheduler that is not there, and end with the test."""
     distributed = pytest.importorskip('distributed')
     clients = []
 
@@ -73,25 +71,22 @@ def distributed(monkeypatch):
 
     make = distributed.Client
     monkeypatch.setattr(distributed, 'Client', client)
-    logging.getLogger('distributed').setLevel(logging.CRITICAL)
-    yield SimpleNamespace(LocalCluster=distributed.LocalCluster, clients=clients)
+    yield distributed
     for client in clients:
         client.close(timeout=1)
 
 
 @pytest.fixture
-def fleet(distributed):
+def fleet(distributed, tmp_path_factory):
     """Makes Dask clusters of so many worker processes."""
     from test_workers import Fleet
 
     fleets = []
 
-    def fleet(count):
-        fleets.append(Fleet(distributed, count))
+    def fleet(count, **environment):
+        fleets.append(Fleet(distributed.Client, tmp_path_factory.mktemp('fleet'), count, **environment))
         return fleets[-1]
 
     yield fleet
-    for client in distributed.clients:
-        client.close(timeout=1)
     for one in fleets:
         one.close()

@@ -1,9 +1,6 @@
 """Workers that are processes of this machine, or of a Dask cluster, and what becomes of the work when they die."""
 
-import contextlib
-import importlib
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -16,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from line_feature_node import workers
 from line_feature_node.workers import ATTEMPTS, Workers, WorkersError, cluster, in_order, inline, local
 
 #: Seconds after which something that a test waits for will not come any more.
@@ -311,23 +309,34 @@ def test_an_address_without_a_scheduler_is_a_sentence(distributed, address):
 
 
 class Fleet:
-    """A scheduler in this process, and workers that are processes of their own; nobody starts them anew."""
+    """A cluster of Dask: a scheduler and workers that are processes of their own; nobody starts them anew."""
 
-    def __init__(self, distributed, count):
-        self._cluster = distributed.LocalCluster(
-            n_workers=0, threads_per_worker=1, processes=True, dashboard_address=':0', silence_logs=logging.CRITICAL)
-        self.address = self._cluster.scheduler_address
-        self.workers = [subprocess.Popen(
-            [sys.executable, '-m', 'distributed.cli.dask_worker', self.address, '--nthreads', '1', '--no-nanny',
-             '--no-dashboard'],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=ENVIRONMENT) for _ in range(count)]
-        until(lambda: len(self._cluster.scheduler_info['workers']) == count, 'workers of Dask')
+    def __init__(self, client, folder, count, **environment):
+        self._place = folder / 'scheduler.json'
+        self._environment = {**ENVIRONMENT, **environment}
+        self.scheduler = self._start('scheduler', '--host', '127.0.0.1', '--port', '0')
+        self.workers = []
+        until(lambda: self._place.exists() and self._place.read_text().endswith('}'), 'scheduler of Dask')
+        self.address = json.loads(self._place.read_text())['address']
+        self._client = client
+        self.add(count)
+
+    def add(self, count):
+        self.workers += [self._start('worker', '--nthreads', '1', '--no-nanny') for _ in range(count)]
+        if self.workers:
+            with self._client(self.address, timeout='10s') as client:
+                client.wait_for_workers(count, timeout=DEADLINE)
+
+    def _start(self, part, *more):
+        return subprocess.Popen(
+            [sys.executable, '-m', f'distributed.cli.dask_{part}', '--scheduler-file', self._place, '--no-dashboard',
+             *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=self._environment,
+            cwd=self._place.parent)
 
     def close(self):
-        for worker in self.workers:
-            worker.kill()
-            worker.wait()
-        self._cluster.close()
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
 
 
 def test_a_cluster_does_the_work_in_order(fleet):
@@ -347,19 +356,20 @@ def test_an_exception_in_a_cluster_passes_through(fleet):
 
 def test_a_cluster_that_loses_a_worker_has_the_same_results(fleet, tmp_path):
     fleet = fleet(2)
-    results = in_order(cluster(fleet.address), mark_and_double, pieces(100, tmp_path))
+    (tmp_path / 'marks').mkdir()
+    results = in_order(cluster(fleet.address), mark_and_double, pieces(100, tmp_path / 'marks'))
     found = [next(results) for _ in range(10)]
-    assert len(processes(tmp_path)) == 2
+    assert len(processes(tmp_path / 'marks')) == 2
     fleet.workers[0].kill()
     found += results
     assert found == doubles(100)
-    assert sum(count > 1 for count in times(tmp_path).values()) <= 4
+    assert sum(count > 1 for count in times(tmp_path / 'marks').values()) <= 4
 
 
 def exhaust(results, errors):
     try:
         list(results)
-    except Exception as error:  # noqa: BLE001, what comes is the question
+    except WorkersError as error:
         errors.append(error)
 
 
@@ -367,55 +377,73 @@ def error_of(results):
     """What the results end with; waited for by another thread, lest results that never end hold up the tests."""
     errors = []
     threading.Thread(target=exhaust, args=(results, errors), daemon=True).start()
-    until(lambda: errors, 'error', 5)
-    assert isinstance(errors[0], WorkersError), repr(errors[0])
-    assert '\n' not in str(errors[0])
+    until(lambda: errors, 'error', 10)
+    message = str(errors[0])
+    assert '\n' not in message
+    return message
 
 
 def test_a_cluster_whose_workers_die_each_time_is_an_error(fleet, tmp_path):
-    config = importlib.import_module('dask').config
-    with config.set({'distributed.scheduler.allowed-failures': 0}):
-        crew = cluster(fleet(ATTEMPTS + 1).address)
-    results = in_order(crew, die_always, pieces(5, tmp_path))
-    assert [next(results) for _ in range(2)] == doubles(2)
-    error_of(results)
-
-
-@pytest.mark.xfail(strict=True, reason='the run waits for ever when the scheduler of Dask has ended')
-def test_a_cluster_whose_scheduler_ends_is_an_error(distributed, tmp_path):
-    place = tmp_path / 'scheduler.json'
+    fleet = fleet(ATTEMPTS + 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES='0')
     (tmp_path / 'marks').mkdir()
-    scheduler, worker = (subprocess.Popen(
-        [sys.executable, '-m', f'distributed.cli.dask_{part}', '--scheduler-file', place, '--no-dashboard', *more],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=ENVIRONMENT, cwd=tmp_path)
-        for part, more in (('scheduler', ('--host', '127.0.0.1', '--port', '0')),
-                           ('worker', ('--nthreads', '1', '--no-nanny'))))
-    try:
-        until(lambda: place.exists() and place.read_text().endswith('}'), 'scheduler')
-        address = json.loads(place.read_text())['address']
-        results = in_order(connected(address), mark_and_double, pieces(1000, tmp_path / 'marks'))
-        next(results)
-        scheduler.kill()
-        error_of(results)
-    finally:
-        for process in (scheduler, worker):
-            process.kill()
-            process.wait()
+    results = in_order(cluster(fleet.address), die_always, pieces(5, tmp_path / 'marks'))
+    assert [next(results) for _ in range(2)] == doubles(2)
+    assert f'killed {ATTEMPTS} times in a row' in error_of(results)
 
 
-def connected(address):
-    """The cluster, once its worker is there."""
-    crews = []
+@pytest.fixture
+def hasty(monkeypatch):
+    """Nobody is waited for longer than a second."""
+    monkeypatch.setattr(workers, 'RETURN', 1.0)
+    monkeypatch.setattr(workers, 'REPLACEMENT', 1.0)
 
-    def there():
-        with contextlib.suppress(WorkersError):
-            crews.append(cluster(address))
-        return crews
 
-    until(there, 'worker of Dask')
-    return crews[0]
+def test_a_cluster_whose_scheduler_ends_is_an_error(fleet, tmp_path, hasty):
+    fleet = fleet(1)
+    (tmp_path / 'marks').mkdir()
+    crew = cluster(fleet.address)
+    results = in_order(crew, mark_and_double, pieces(1000, tmp_path / 'marks'))
+    next(results)
+    fleet.scheduler.kill()
+    assert error_of(results) == f'the Dask scheduler at {fleet.address} does not answer any more'
+    assert 'does not answer any more' in error_of(in_order(crew, double, pieces(3)))
+
+
+def test_a_cluster_whose_workers_have_all_ended_is_an_error(fleet, tmp_path, hasty):
+    fleet = fleet(2)
+    (tmp_path / 'marks').mkdir()
+    results = in_order(cluster(fleet.address), mark_and_double, pieces(1000, tmp_path / 'marks'))
+    next(results)
+    for worker in fleet.workers:
+        worker.kill()
+    assert error_of(results) == f'the Dask cluster at {fleet.address} has had no workers for 1 s'
+
+
+def test_new_workers_go_on_for_those_that_have_all_ended(fleet, tmp_path):
+    fleet = fleet(1)
+    (tmp_path / 'marks').mkdir()
+    results = in_order(cluster(fleet.address), mark_and_double, pieces(50, tmp_path / 'marks'))
+    found = [next(results) for _ in range(5)]
+    fleet.workers[0].kill()
+    fleet.add(1)
+    assert found + list(results) == doubles(50)
 
 
 def test_a_cluster_without_workers_is_a_sentence(fleet):
     with pytest.raises(WorkersError, match='has no workers'):
         cluster(fleet(0).address)
+
+
+def test_workers_of_another_version_are_a_sentence(fleet, tmp_path):
+    other = tmp_path / 'other' / 'line_feature_node-0.0.1.dist-info'
+    other.mkdir(parents=True)
+    (other / 'METADATA').write_text('Metadata-Version: 2.1\nName: line_feature_node\nVersion: 0.0.1\n')
+    path = os.pathsep.join([str(other.parent), ENVIRONMENT['PYTHONPATH']])
+    with pytest.raises(WorkersError, match=r'have line_feature_node 0\.0\.1, but here it is'):
+        cluster(fleet(1, PYTHONPATH=path).address)
+
+
+def test_workers_that_lack_the_package_are_a_sentence(fleet, monkeypatch):
+    monkeypatch.setattr(workers, 'PACKAGE', 'no_such_package')
+    with pytest.raises(WorkersError, match='lack no_such_package'):
+        cluster(fleet(1).address)
