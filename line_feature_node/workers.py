@@ -11,8 +11,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from typing import Any
@@ -57,44 +58,110 @@ class Workers:
 def local(count: int | None = None) -> Workers:
     """Processes of this machine, as many as there are processors unless a number is given."""
     number = count or len(os.sched_getaffinity(0))
-    return Workers(number, lambda: _pool(number))
+    return Workers(number, lambda: _processes(number))
 
 
 @contextlib.contextmanager
-def _pool(count: int) -> Iterator[Executor]:
-    others = set(multiprocessing.active_children())
-    pool = _Pool(count)
+def _processes(count: int) -> Iterator[Executor]:
+    resource_tracker.ensure_running()  # when it starts, it lets interrupts through again
+    processes = _Processes(count)
     try:
-        yield pool
+        yield processes
     except BaseException:
-        # Nobody wants any more what is under way, which may take long.
-        pool.stop_starting()
-        for process in set(multiprocessing.active_children()) - others:
-            process.kill()
+        processes.kill()  # nobody wants any more what is under way, which may take long
         raise
     finally:
-        pool.stop_starting()
-        pool.shutdown(wait=True, cancel_futures=True)
+        processes.shutdown(wait=True, cancel_futures=True)
 
 
-class _Pool(ProcessPoolExecutor):
-    """Starts its processes in a thread of its own, which blocks interrupts, as the processes then do from the first.
+class _Processes(ThreadPoolExecutor):
+    """Threads that have their work done by a process each; one that dies is replaced, and its work done again.
 
-    No handler of signals runs in that thread either, which would leave a process that is half started.
+    A ProcessPoolExecutor waits without end where a process dies while it sends a result, as the others hold the same
+    pipe; here each has its own, which ends with it. A process takes over from its thread that interrupts are blocked,
+    and no handler of signals runs there, which would leave it half started.
     """
 
     def __init__(self, count: int) -> None:
-        super().__init__(count, multiprocessing.get_context('spawn'), _begin)
-        resource_tracker.ensure_running()  # where it is started, interrupts are let through again
-        self._starter = ThreadPoolExecutor(1, 'starter', signal.pthread_sigmask, (signal.SIG_BLOCK, [signal.SIGINT]))
+        super().__init__(count, 'process', signal.pthread_sigmask, (signal.SIG_BLOCK, [signal.SIGINT]))
+        self._of_thread = threading.local()
+        self._started: list[_Process] = []
+        self._killed = False
 
-    def submit(self, work: Any, /, *arguments: Any, **options: Any) -> Any:
+    def submit(self, work: Any, /, *arguments: Any, **options: Any) -> 'Future[Any]':
         """As any executor does."""
-        return self._starter.submit(super().submit, work, *arguments, **options).result()
+        return super().submit(self._do, partial(work, *arguments, **options))
 
-    def stop_starting(self) -> None:
-        """Let the process that is being started be the last."""
-        self._starter.shutdown(wait=True)
+    def kill(self) -> None:
+        """End all at once; what is not done is broken."""
+        self._killed = True
+        for process in list(self._started):
+            process.kill()
+
+    def shutdown(self, *arguments: Any, **options: Any) -> None:
+        """As any executor does."""
+        super().shutdown(*arguments, **options)
+        for process in self._started:
+            process.close()
+
+    def _do(self, call: Callable[[], Any]) -> Any:
+        for _ in range(ATTEMPTS):
+            with contextlib.suppress(EOFError, OSError):
+                error, result = self._process().do(call)
+                break
+            self._of_thread.process = None
+        else:
+            raise WorkersError(f'workers were killed {ATTEMPTS} times in a row, perhaps for want of memory')
+        if error is not None:
+            raise error
+        return result
+
+    def _process(self) -> '_Process':
+        """The process of the thread."""
+        if getattr(self._of_thread, 'process', None) is None and not self._killed:
+            self._of_thread.process = _Process()
+            self._started.append(self._of_thread.process)
+        if self._killed:
+            self.kill()  # that one, too
+            raise BrokenExecutor
+        process: _Process = self._of_thread.process
+        return process
+
+
+class _Process:
+    """A process that does one piece of work after the other."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context('spawn')
+        self._pipe, its = context.Pipe()
+        with its:
+            self._process = context.Process(target=_serve, args=(its,), daemon=True)
+            self._process.start()
+
+    def do(self, call: Callable[[], Any]) -> tuple[BaseException | None, Any]:
+        """What a call raises or returns there; EOFError or OSError where the process dies."""
+        self._pipe.send(call)
+        error, result = self._pipe.recv()
+        return error, result
+
+    def kill(self) -> None:
+        """End it at once."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """Let it end, and wait until it has."""
+        self._pipe.close()
+        self._process.join()
+
+
+def _serve(pipe: Any) -> None:
+    """Do what comes through a pipe until that ends."""
+    _begin()
+    with contextlib.suppress(EOFError, OSError), ThreadPoolExecutor(1) as thread:
+        while True:
+            future = thread.submit(pipe.recv())
+            error = future.exception()
+            pipe.send((error, None if error else future.result()))
 
 
 def _begin() -> None:
@@ -242,14 +309,14 @@ def _results(
     ahead = 2 * workers.count
     under_way: deque[Future[bytes]] = deque(executor.submit(work, *piece) for piece in list(remaining)[:ahead])
     while under_way:
-        result = _result(under_way.popleft(), workers)
+        result = _result(under_way.popleft(), workers.look)
         remaining.popleft()
         yield result  # before anything that fails when workers died, or it would be lost
         if len(remaining) > len(under_way):
             under_way.append(executor.submit(work, *remaining[len(under_way)]))
 
 
-def _result(future: 'Future[bytes]', workers: Workers) -> bytes:
+def _result(future: 'Future[bytes]', look: Callable[[], None]) -> bytes:
     while not concurrent.futures.wait([future], LOOK).done:
-        workers.look()
+        look()
     return future.result()
