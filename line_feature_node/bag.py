@@ -9,7 +9,9 @@ import errno
 import fcntl
 import hashlib
 import heapq
+import importlib.metadata
 import json
+import math
 import os
 import shutil
 import sqlite3
@@ -21,6 +23,7 @@ from typing import Any, Literal
 
 from rosbags.interfaces import (
     Connection,
+    MessageDefinitionFormat,
     Qos,
     QosDurability,
     QosHistory,
@@ -29,10 +32,11 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
 from line_feature_node.core import SEGMENT_DTYPE
-from line_feature_node.recordings import RecordingError, Slice, is_ros1, opened, plan, typestore
+from line_feature_node.frames import Frames
+from line_feature_node.recordings import RecordingError, Slice, as_ros2, is_ros1, opened, plan, told, typestore
 from line_feature_node.slices import CSV, OUTPUTS, Frame, Job, process_slice, unpack
 from line_feature_node.workers import Workers, in_order, inline
 
@@ -66,6 +70,9 @@ class Run:
         copy: Whether everything of the input is copied, too.
         overwrite: Whether a target that exists is replaced.
         resume: Whether what an earlier run left is used.
+
+    Raises:
+        ValueError: There is no time between start and end.
     """
 
     job: Job
@@ -78,6 +85,11 @@ class Run:
     overwrite: bool = False
     resume: bool = False
 
+    def __post_init__(self) -> None:
+        begin, stop = self.start or 0.0, math.inf if self.end is None else self.end
+        if not begin < stop:
+            raise ValueError(f'end must be later than start, got {stop:g} s and {begin:g} s')
+
 
 @dataclass
 class Outcome:
@@ -87,24 +99,26 @@ class Outcome:
         source, target: The recording and the bag that was made of it.
         frames: All of them, without their messages.
         error: Why nothing came of it, one sentence; '' where something did.
-        uncopied: Topics that could not be copied.
+        uncopied: Topics that could not be copied, for want of their types.
+        spoilt: How many messages could not be copied, by topic and reason.
     """
 
     source: Path
     target: Path
-    frames: list[Frame] = field(default_factory=list)
+    frames: Frames = field(default_factory=Frames)
     error: str = ''
     uncopied: list[str] = field(default_factory=list)
+    spoilt: Counter[str] = field(default_factory=Counter)
 
     @property
     def failed(self) -> Counter[str]:
         """How many frames failed, by reason."""
-        return Counter(frame.error for frame in self.frames if frame.error)
+        return self.frames.failed
 
     @property
     def segments(self) -> int:
         """How many segments were found."""
-        return sum(frame.segments for frame in self.frames)
+        return int(self.frames.table['segments'].sum())
 
 
 def process_recording(
@@ -132,7 +146,8 @@ def process_recording(
         raise TargetError(f'{target} is the folder that this is started in, or above it: name a new one')
     if there.exists() and not run.overwrite:
         raise TargetError(f'{target} exists: --overwrite replaces it')
-    slices = plan(source, topics=list(run.topics), start=run.start, end=run.end, every=run.every)
+    slices = [replace(part, path=source.absolute())  # workers may be in other folders
+              for part in plan(source, topics=list(run.topics), start=run.start, end=run.end, every=run.every)]
     outcome = Outcome(source, target)
     if not slices:
         outcome.error = NO_IMAGES
@@ -143,7 +158,7 @@ def process_recording(
             for frame in work.write(number, unpack(data), outcome):
                 watch(number, len(slices), frame)
             watch(number + 1, len(slices), None)
-        outcome.uncopied = work.uncopied
+        outcome.uncopied, outcome.spoilt = work.uncopied, work.spoilt
         work.finish()
     return outcome
 
@@ -159,6 +174,8 @@ def _told(target: Path) -> Iterator[None]:
         raise TargetError(f'cannot write {target}: {error.strerror or error}') from error
     except sqlite3.Error as error:
         raise TargetError(f'cannot write {target}: {error}') from error
+    except OverflowError as error:
+        raise TargetError(f'cannot write {target}: a stamp is beyond what the storage can have ({error})') from error
 
 
 class _Work:
@@ -178,6 +195,7 @@ class _Work:
         self._stack = contextlib.ExitStack()
         self._offsets = dict.fromkeys(slices[0].topics, 0)
         self.uncopied: list[str] = []
+        self.spoilt: Counter[str] = Counter()
 
     def __enter__(self) -> '_Work':
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -201,8 +219,8 @@ class _Work:
         if self._target.exists() and not self._run.overwrite:
             raise TargetError(f'{self._target} exists: --overwrite replaces it')
         if self._run.resume and record.exists() and record.read_text() != described:
-            raise TargetError(f'{self._folder} is of a run with other settings or another recording: remove it, '
-                              f'or run without --resume')
+            raise TargetError(f'{self._folder} is of a run with other settings, another recording or another version: '
+                              f'remove it, or run without --resume')
         for old in (self._bag.parent, *(() if self._run.resume else (self._journal,))):
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(old)
@@ -220,19 +238,21 @@ class _Work:
         self._copier = _Copier(self._stack.enter_context(opened(self._source)), self._source, self._writer,
                                {f'{topic}/{name}' for topic, name in self._connections}) if self._run.copy else None
         if self._copier:
-            self.uncopied = self._copier.left_out
+            self.uncopied, self.spoilt = self._copier.left_out, self._copier.spoilt
         self._csv = None
         if self._run.job.csv:
             self._csv = self._stack.enter_context((self._folder / 'segments.csv').open('w', newline=''))
             self._csv.write(','.join(('stamp', 'topic', 'frame', *(SEGMENT_DTYPE.names or ()))) + '\n')
 
     def _description(self) -> dict[str, Any]:
-        """All that the results of the slices depend on."""
-        files = [self._source] if self._source.is_file() else sorted(self._source.iterdir())
+        """All that the results of the slices depend on; where the recording lies is not of it."""
+        source = self._source.resolve()
+        files = [source] if source.is_file() else sorted(source.iterdir())
         mask = self._run.job.mask
         job = {**asdict(self._run.job), 'mask': '' if mask is None else hashlib.sha256(mask.tobytes()).hexdigest()}
-        return {'files': [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files], 'job': job,
-                'slices': [asdict(part) for part in self._slices]}
+        return {'version': importlib.metadata.version('line_feature_node'), 'job': job,
+                'files': [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files],
+                'slices': [asdict(replace(part, path=Path())) for part in self._slices]}
 
     def results(self, workers: Workers) -> Generator[bytes, None, None]:
         """What was made of each slice, in order; what an earlier run made is taken from the journal."""
@@ -350,7 +370,9 @@ class _Copier:
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._targets: dict[int, Connection] = {}
         self._sources: list[Connection] = []
+        self._path = source
         self.left_out: list[str] = []
+        self.spoilt: Counter[str] = Counter()
         for connection in reader.connections:
             if connection.topic in taken:
                 continue
@@ -369,9 +391,9 @@ class _Copier:
         if self._ros1:
             self._learn(get_types_from_msg(connection.msgdef.data, connection.msgtype))
             return writer.add_connection(connection.topic, connection.msgtype, typestore=self._types)
-        if connection.msgdef.data and connection.digest:
+        if connection.msgdef.data:
             return writer.add_connection(connection.topic, connection.msgtype, msgdef=connection.msgdef.data,
-                                         rihs01=connection.digest, offered_qos_profiles=qos)
+                                         rihs01=connection.digest or _hash(connection), offered_qos_profiles=qos)
         return writer.add_connection(connection.topic, connection.msgtype, typestore=typestore(ros1=False),
                                      offered_qos_profiles=qos)
 
@@ -388,11 +410,33 @@ class _Copier:
                 raise ValueError(f'{name} is another in ROS 2')
         self._types.register({name: definition for name, definition in types.items() if name not in known})
 
-    def messages(self, start: int | None, stop: int | None) -> Iterator[tuple[int, Connection, Any]]:
-        """Stamp, connection of the new bag, and bytes of the messages in a span of time."""
-        for connection, stamp, data in self._reader.messages(self._sources, start, stop) if self._sources else ():
-            copied = bytes(self._types.ros1_to_cdr(data, connection.msgtype)) if self._ros1 else data
-            yield stamp, self._targets[connection.id], copied
+    def messages(self, start: int | None, stop: int | None) -> Iterator[tuple[int, Connection, bytes]]:
+        """Stamp, connection of the new bag, and bytes of the messages in a span of time; what is spoilt is counted.
+
+        Raises:
+            RecordingError: The recording cannot be read on.
+        """
+        with told(self._path):
+            for connection, stamp, data in self._reader.messages(self._sources, start, stop) if self._sources else ():
+                copied = self._converted(connection, data) if self._ros1 else data
+                if copied is not None:
+                    yield stamp, self._targets[connection.id], copied
+
+    def _converted(self, connection: Connection, data: bytes) -> bytes | None:
+        try:
+            return as_ros2(self._types, data, connection.msgtype)
+        except ValueError as error:
+            self.spoilt[f'{connection.topic}: {error}'] += 1
+            return None
+
+
+def _hash(connection: Connection) -> str:
+    """The hash of a type, by the definition that a recording has of it; a lone mcap lacks hashes."""
+    types = get_typestore(Stores.EMPTY)
+    idl = connection.msgdef.format == MessageDefinitionFormat.IDL
+    types.register(get_types_from_idl(connection.msgdef.data) if idl else
+                   get_types_from_msg(connection.msgdef.data, connection.msgtype))
+    return types.hash_rihs01(connection.msgtype)
 
 
 def _write_whole(path: Path, data: bytes) -> None:

@@ -1,8 +1,8 @@
 """The command `line_features bag`: recordings in, bags with segments out."""
 
 import json
+import math
 import signal
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,13 +10,15 @@ from typing import Annotated, Any, Optional
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from line_feature_node.bag import NO_IMAGES, Outcome, Run, TargetError, process_recording
 from line_feature_node.cli_options import console, errors, fail
 from line_feature_node.core import Parameters
-from line_feature_node.files import read_mask
+from line_feature_node.files import read_mask, unique_names
+from line_feature_node.options import Options
 from line_feature_node.recordings import RecordingError, find_recordings
 from line_feature_node.report import check_report, write_report
 from line_feature_node.slices import OUTPUTS, Frame, Job
@@ -39,6 +41,7 @@ def bag(
         metavar='IN', readable=False, help='Recordings (.bag, .mcap, .db3, folders of ROS 2), or folders of them.')],
     parameters: Parameters,
     profile: str,
+    options: Options,
     out: Annotated[Path, typer.Option(help='The new bag; of several recordings, the folder for theirs.')],
     topic: Annotated[Optional[list[str]], typer.Option(help='Topic of images; all of them unless given.')] = None,
     start: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to start at.')] = None,
@@ -60,21 +63,25 @@ def bag(
 ) -> None:
     """Extract the segments of recordings into new bags: segments, markers and overlays beside the stamps of the images.
 
-    Ends with status 0 when all went well, 1 when some frames or recordings failed, and 2 when nothing could be read.
+    Ends with status 0 when all went well, 1 when some frames, copies or recordings failed, and 2 when nothing could
+    be read.
     """
     if storage not in ('mcap', 'sqlite3'):
         raise typer.BadParameter(f'storage must be mcap or sqlite3, got {storage!r}')
     try:
-        mask = read_mask(mask_file) if mask_file else None
+        # As in the node, a path in the file is relative to the folder that one is in.
+        masks = [*([mask_file] if mask_file else []), *([Path(options.mask_file)] if options.mask_file else [])]
+        mask = read_mask(masks[0]) if masks else None
         sources = find_recordings(recordings)
         pairs = list(_targets(sources, out))
+        job = Job(parameters, mask, outputs=('segments',) if only_segments else tuple(OUTPUTS), truth=truth, csv=csv,
+                  jpeg_quality=options.jpeg_quality)
+        run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)
         if report:
             check_report(report, pairs, overwrite=overwrite)
         crew = cluster(scheduler) if scheduler else local(workers)
     except (RecordingError, TargetError, WorkersError, ValueError) as error:
         fail(str(error))
-    job = Job(parameters, mask, outputs=('segments',) if only_segments else tuple(OUTPUTS), truth=truth, csv=csv)
-    run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)
     outcomes = []
     try:
         with _interruptible():
@@ -95,6 +102,7 @@ def bag(
     elif not quiet:
         for outcome in outcomes:
             if outcome.frames:
+                console.print(f'{outcome.source}: written to {outcome.target}', markup=False)
                 console.print(_table(outcome))
     raise typer.Exit(status)
 
@@ -104,11 +112,9 @@ def _targets(sources: list[Path], out: Path) -> Iterator[tuple[Path, Path]]:
     if len(sources) == 1:
         yield sources[0], out
         return
-    taken: Counter[str] = Counter()
-    for source in sources:
-        name = source.name if source.is_dir() else source.stem
-        taken[name] += 1
-        yield source, out / (name if taken[name] == 1 else f'{name}-{taken[name]}')
+    names = unique_names(source.name if source.is_dir() else source.stem for source in sources)
+    for source, name in zip(sources, names, strict=True):
+        yield source, out / name
 
 
 def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool) -> Outcome:
@@ -125,6 +131,8 @@ def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool
         errors.print(f'{source}: {count} frames failed: {reason}', markup=False)
     if outcome.uncopied:
         errors.print(f'{source}: not copied, for want of their types: {", ".join(outcome.uncopied)}', markup=False)
+    for reason, count in outcome.spoilt.most_common():
+        errors.print(f'{source}: {count} messages not copied: {reason}', markup=False)
     return outcome
 
 
@@ -175,10 +183,10 @@ def _status(outcomes: list[Outcome]) -> int:
     unread = [outcome for outcome in outcomes if outcome.error and not _empty(outcome)]
     if len(unread) == len(outcomes):
         return 2
-    processed = [frame for outcome in outcomes for frame in outcome.frames]
-    if processed and all(frame.error for frame in processed):
+    failed = sum(outcome.failed.total() for outcome in outcomes)
+    if failed and failed == sum(len(outcome.frames) for outcome in outcomes):
         return 2
-    return 1 if unread or any(frame.error for frame in processed) else 0
+    return 1 if unread or failed or any(outcome.uncopied or outcome.spoilt for outcome in outcomes) else 0
 
 
 def _empty(outcome: Outcome) -> bool:
@@ -191,29 +199,42 @@ def _summary(outcome: Outcome) -> dict[str, Any]:
         'source': str(outcome.source), 'target': str(outcome.target), 'error': outcome.error,
         'frames': len(outcome.frames), 'failed': dict(outcome.failed), 'segments': outcome.segments,
     }
-    agreements = [frame.agreement for frame in outcome.frames if frame.agreement]
-    if agreements:
-        precision, recall, angle, offset = np.nanmedian(agreements, axis=0).tolist()
-        summary['truth'] = {'frames': len(agreements), 'precision': precision, 'recall': recall,
-                            'angle_degrees': float(np.degrees(angle)), 'offset_pixels': offset}
+    if outcome.uncopied or outcome.spoilt:
+        summary['uncopied'] = {'topics': outcome.uncopied, 'messages': dict(outcome.spoilt)}
+    compared = outcome.frames.table[outcome.frames.table['compared']]
+    if len(compared):
+        precision, recall, angle, offset = map(_median, compared['agreement'].T)
+        summary['truth'] = {
+            'frames': len(compared), 'precision': precision, 'recall': recall,
+            'angle_degrees': None if angle is None else math.degrees(angle), 'offset_pixels': offset}
     return summary
+
+
+def _median(values: NDArray[np.floating]) -> float | None:
+    """Of those that are numbers; None where none is."""
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else None
 
 
 def _table(outcome: Outcome) -> Table:
     """What became of a recording, for people."""
-    table = Table(str(outcome.source), '')
-    table.columns[1].justify = 'right'
-    good = [frame for frame in outcome.frames if not frame.error]
+    table = Table(show_header=False)
+    table.add_column()
+    table.add_column(justify='right')
+    good = outcome.frames.good
     table.add_row('frames', str(len(outcome.frames)))
     table.add_row('of them failed', str(len(outcome.frames) - len(good)))
     table.add_row('segments', str(outcome.segments))
-    if good:
-        table.add_row('extraction of a frame (median)', f'{np.median([frame.seconds for frame in good]) * 1e3:.2f} ms')
+    if len(good):
+        table.add_row('extraction of a frame (median)', f'{np.median(good["seconds"]) * 1e3:.2f} ms')
     agreement = _summary(outcome).get('truth')
     if agreement:
-        table.add_row('against the truth (medians)',
-                      f'precision {agreement["precision"]:.2f}, recall {agreement["recall"]:.2f}, '
-                      f'{agreement["angle_degrees"]:.2f} degrees, {agreement["offset_pixels"]:.2f} px')
-    if good:
-        table.add_row('written to', str(outcome.target))
+        table.add_row('precision (median)', _shown(agreement['precision']))
+        table.add_row('recall (median)', _shown(agreement['recall']))
+        table.add_row('off by (median)', f'{_shown(agreement["angle_degrees"])} degrees, '
+                                         f'{_shown(agreement["offset_pixels"])} pixels')
     return table
+
+
+def _shown(value: float | None) -> str:
+    return '-' if value is None else f'{value:.2f}'

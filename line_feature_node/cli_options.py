@@ -10,7 +10,11 @@ import typer
 from rich.console import Console
 
 from line_feature_node.core import PROFILES, Parameters
+from line_feature_node.options import Options
 from line_feature_node.parameter_files import read_parameter_file
+
+#: What is made of options and file, by the name that a command has it under.
+MADE = ('parameters', 'profile', 'options')
 
 console, errors = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -24,23 +28,21 @@ def fail(message: str) -> NoReturn:
 def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command, which takes `parameters`, options for a file, for `profile` and for each of Parameters instead.
 
-    What is given as an option wins over what the file says, and that over the profile. A command that takes `profile`
-    gets the name of the one they started from.
+    What is given as an option wins over what the file says, and that over the profile. A command may take more of MADE:
+    the name of the profile they started from, and the options of the node, as the file sets them.
     """
 
     def run(params_file: Path | None, profile: str | None, **values: Any) -> None:
         own = {name: values.pop(name) for name in kept}
         given = {name: value for name, value in values.items() if value is not None}
         try:
-            own['profile'], parameters = _parameters(params_file, profile, given)
+            made = dict(zip(MADE, _parameters(params_file, profile, given), strict=True))
         except (TypeError, ValueError) as error:
             raise typer.BadParameter(str(error)) from None
-        if 'profile' not in signature.parameters:
-            del own['profile']
-        command(**own, parameters=parameters)
+        command(**own, **{name: value for name, value in made.items() if name in signature.parameters})
 
     signature = inspect.signature(command)
-    kept = [name for name in signature.parameters if name not in ('parameters', 'profile')]
+    kept = [name for name in signature.parameters if name not in MADE]
     options: dict[str, tuple[Any, str]] = {
         'params-file': (Path, 'Parameter file (YAML) of a ROS 2 node, whose values are taken.'),
         'profile': (str, f'Set of parameters to start from: {", ".join(PROFILES)}; default default.')}
@@ -61,11 +63,12 @@ def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _parameters(path: Path | None, profile: str | None, given: dict[str, Any]) -> tuple[str, Parameters]:
-    """The name of the profile that is started from, and what comes of it."""
+def _parameters(path: Path | None, profile: str | None, given: dict[str, Any]) -> tuple[Parameters, str, Options]:
+    """What is made of options and file, in the order of MADE."""
     values, unknown = read_parameter_file(path) if path else ({}, [])
     for name in unknown:
         errors.print(f'{path}: there is no parameter {name!r}, what it is set to has no effect', markup=False)
     own = {name: value for name, value in values.items() if name in Parameters.specs()}
-    name = profile or values.get('profile', 'default')
-    return name, Parameters.profile(name, **{**own, **given})
+    options = Options.of({name: value for name, value in values.items() if name in Options.specs()})
+    name = profile or options.profile
+    return Parameters.profile(name, **{**own, **given}), name, options

@@ -94,21 +94,21 @@ def process(
         return _process(path, out / name, of_thread.extractor, stages=stages)
 
     with ThreadPoolExecutor(workers or os.cpu_count()) as executor:
-        yield from executor.map(work, paths, _names(paths))
+        yield from executor.map(work, paths, unique_names(path.stem for path in paths))
 
 
-def _names(paths: list[Path]) -> list[str]:
-    """A name for the results of each file: its own without ending, numbered where that is taken."""
-    names: list[str] = []
+def unique_names(names: Iterable[str]) -> list[str]:
+    """A name for the results of each; its own, numbered where that is taken."""
+    unique: list[str] = []
     taken: set[str] = set()
-    for path in paths:
-        name, number = path.stem, 1
+    for own in names:
+        name, number = own, 1
         while name in taken:
             number += 1
-            name = f'{path.stem}-{number}'
+            name = f'{own}-{number}'
         taken.add(name)
-        names.append(name)
-    return names
+        unique.append(name)
+    return unique
 
 
 def _process(path: Path, target: Path, extractor: LineFeatureExtractor, *, stages: bool) -> Outcome:

@@ -22,15 +22,19 @@ def read_parameter_file(path: Path) -> tuple[dict[str, Any], list[str]]:
         ValueError: It cannot be read, or is no such file; the message is a sentence.
     """
     try:
+        return _read(path)
+    except RecursionError:
+        raise ValueError(f'{path}: what it says contains itself, or is nested too deep') from None
+
+
+def _read(path: Path) -> tuple[dict[str, Any], list[str]]:
+    try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except OSError as error:
         raise ValueError(f'{path}: {error.strerror}') from None
     except (ValueError, yaml.YAMLError) as error:  # not UTF-8, or a date that does not exist
         raise ValueError(f'{path}: not YAML ({" ".join(str(error).split())})') from None
-    try:
-        sections = [section['ros__parameters'] for section in _sections(content)]
-    except RecursionError:
-        raise ValueError(f'{path}: what it says contains itself, or is nested too deep') from None
+    sections = [section['ros__parameters'] for section in _sections(content)]
     if not sections:
         raise ValueError(f'{path}: no ros__parameters in it, as parameter files of ROS 2 have them')
     values: dict[str, Any] = {}

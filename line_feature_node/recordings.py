@@ -98,9 +98,19 @@ def opened(path: Path) -> Iterator[Reader]:
         raise RecordingError(f'{path}: the file is empty')
     if path.is_file() and path.suffix not in SUFFIXES:
         raise RecordingError(f'{path}: not a recording, expected one of {", ".join(SUFFIXES)} or a folder')
+    with told(path), (Reader1(path) if is_ros1(path) else Reader2(path)) as reader:
+        yield reader
+
+
+@contextmanager
+def told(path: Path) -> Iterator[None]:
+    """Make a sentence of what a library says of a recording.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
     try:
-        with (Reader1(path) if is_ros1(path) else Reader2(path)) as reader:
-            yield reader
+        yield
     except (RecordingError, GeneratorExit):
         raise
     except OSError as error:
@@ -146,6 +156,18 @@ def deserialize(path: Path, data: bytes, msgtype: str) -> Any:
         raise ValueError(f'{len(data)} bytes that are no {msgtype}: {_reason(error)}') from error
 
 
+def as_ros2(types: Any, data: bytes, msgtype: str) -> bytes:
+    """A message of ROS 1 as ROS 2 serialises it.
+
+    Raises:
+        ValueError: The bytes are none; the message says so whatever their number, so that such messages can be counted.
+    """
+    try:
+        return bytes(types.ros1_to_cdr(data, msgtype))
+    except Exception as error:
+        raise ValueError(f'no {msgtype}: {_reason(error)}') from error
+
+
 def plan(
     path: Path, *, topics: list[str], start: float | None = None, end: float | None = None, every: int = 1,
 ) -> list[Slice]:
@@ -154,7 +176,7 @@ def plan(
     Args:
         path: The recording.
         topics: Topics to be processed; empty for all that have images.
-        start, end: Seconds from the beginning of the recording.
+        start, end: Seconds from the beginning of the recording, up to infinity.
         every: One of so many frames of a topic is to be processed.
 
     Returns:
@@ -173,11 +195,12 @@ def plan(
         count = sum(connection.msgcount for connection in connections)
         if not connections or not count:
             return []
-        begin = reader.start_time + round((start or 0) * 1e9)
-        stop = reader.end_time if end is None else min(reader.end_time, reader.start_time + round(end * 1e9))
+        duration = reader.end_time - reader.start_time
+        begin, stop = (reader.start_time + round(min(seconds * 1e9, duration))
+                       for seconds in (start or 0, math.inf if end is None else end))
         if begin >= stop:
             return []
-        share = (stop - begin) / max(reader.end_time - reader.start_time, 1)
+        share = (stop - begin) / duration
         number = max(1, math.ceil(count * share / SLICE))
         edges = [begin + (stop - begin) * k // number for k in range(number + 1)]
         slices = [Slice(path, chosen, first, last, every) for first, last in pairwise(edges)]

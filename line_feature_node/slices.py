@@ -89,10 +89,10 @@ class Frame:
 
 
 def process_slice(part: Slice, job: Job) -> bytes:
-    """Process the frames of a slice, in their order; the same bytes whoever does it.
+    """Process the frames of a slice, in their order; the same messages whoever does it.
 
     Returns:
-        The frames, packed.
+        The frames, packed; only the seconds that they took differ from time to time.
 
     Raises:
         RecordingError: The recording cannot be read.

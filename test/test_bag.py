@@ -2,12 +2,15 @@ import csv
 import dataclasses
 import errno
 import hashlib
+import importlib.metadata
+import math
 import os
 import resource
 import shutil
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,7 +20,7 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import Reader, Writer
+from rosbags.rosbag2 import CompressionMode, Reader, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_recordings import (
     BEGIN,
@@ -213,7 +216,7 @@ def test_every_kind_of_input_gives_the_same(result, tmp_path):
         assert read(tmp_path / f'out{number}') == read(result)
 
 
-def test_the_outcome_has_every_frame_and_some_overlays(source, tmp_path):
+def test_the_outcome_has_every_frame(source, tmp_path):
     seen = []
     outcome = process(source, tmp_path / 'out', watch=lambda *news: seen.append(news))
     assert (outcome.source, outcome.target, outcome.error, outcome.uncopied) == (source, tmp_path / 'out', '', [])
@@ -222,8 +225,10 @@ def test_the_outcome_has_every_frame_and_some_overlays(source, tmp_path):
     assert all(frame.messages == {} for frame in outcome.frames)
     assert outcome.segments == sum(len(found(picture(number))) for number in range(100))
     assert not outcome.failed
-    assert 1 <= len(outcome.overlays) <= 8
-    assert [news[2] for news in seen if news[2] is not None] == outcome.frames
+    assert [news[2] for news in seen if news[2] is not None] == [
+        dataclasses.replace(frame, seconds=news[2].seconds, orientations=news[2].orientations)
+        for frame, news in zip(outcome.frames, [news for news in seen if news[2] is not None], strict=True)]
+    assert all(sum(frame.orientations) > 0 for frame in outcome.frames)
     assert [news[:2] for news in seen if news[2] is None] == [(done, 4) for done in range(1, 5)]
 
 
@@ -261,6 +266,21 @@ def test_frames_that_fail_are_counted_by_reason_and_the_rest_goes_on(tmp_path):
     assert len(outcome.frames) == 40
     good = [stamp_of(number) for number in range(40) if number not in (3, 5, 20, 35)]
     assert [stamp for _, stamp, _ in of(read(tmp_path / 'out'), '/segments')] == good
+
+
+@pytest.mark.parametrize(('start', 'end'), [(2.0, 2.0), (2.0, 1.0), (None, 0.0), (math.nan, None), (None, math.nan),
+                                            (math.inf, None), (math.inf, math.inf)])
+def test_no_time_between_start_and_end_is_refused(start, end):
+    with pytest.raises(ValueError, match='end must be later than start, got '):
+        Run(JOB, start=start, end=end)
+
+
+def test_times_beyond_the_recording_mean_its_end(source, result, tmp_path):
+    process(source, tmp_path / 'out', start=0.0, end=math.inf)
+    assert read(tmp_path / 'out') == read(result)
+    process(source, tmp_path / 'far', end=1e300)
+    assert read(tmp_path / 'far') == read(result)
+    assert process(source, tmp_path / 'none', start=1e300).error == bag.NO_IMAGES
 
 
 def test_without_images_there_is_a_sentence_and_no_target(tmp_path):
@@ -475,7 +495,6 @@ def test_types_that_ros2_has_otherwise_are_left_out_and_said(tmp_path):
     assert {topic for topic, _, _ in read(tmp_path / 'out')} == {'/camera', *(f'/camera/{name}' for name in ENDINGS)}
 
 
-@pytest.mark.xfail(strict=True, reason='a lone mcap has no hashes of types, and its definitions are not used')
 def test_types_that_a_lone_file_defines_are_copied(tmp_path):
     types = with_own(Stores.ROS2_JAZZY)
     path = lone(write(tmp_path / 'rec', rich(types, 3), types=types), tmp_path / 'lone.mcap')
@@ -484,13 +503,48 @@ def test_types_that_a_lone_file_defines_are_copied(tmp_path):
     assert len([topic for topic, _, _ in read(tmp_path / 'out') if topic == '/own']) == 3
 
 
-@pytest.mark.xfail(strict=True, reason='an error of rosbags is raised as it is')
-def test_a_bad_message_that_is_to_be_copied_is_a_sentence(tmp_path):
-    entries = [*film(3, types=ROS1), ('/words', TEXT, BEGIN, b'\xff\0\0\0')]
-    with pytest.raises((RecordingError, TargetError)) as error:
-        process(write_ros1(tmp_path / 'rec.bag', entries), tmp_path / 'out', copy=True)
-    one_sentence(error)
+def test_definitions_of_a_lone_file_give_the_hashes_of_ros2(tmp_path):
+    types = with_own(Stores.ROS2_JAZZY)
+    path = write(tmp_path / 'rec', rich(types, 3), types=types)
+    hashes = {topic: connection.digest for topic, connection in topics(path).items()}
+    process(lone(path, tmp_path / 'lone.mcap'), tmp_path / 'out', copy=True)
+    copied = topics(tmp_path / 'out')
+    assert {topic: copied[topic].digest for topic in hashes} == hashes
+
+
+def test_bad_messages_are_not_copied_but_counted_and_the_rest_goes_on(tmp_path):
+    entries = [*film(3, types=ROS1), ('/words', TEXT, stamp_of(2), text('good', ROS1)),
+               *(('/words', TEXT, stamp_of(number), b'\xff\0\0\0') for number in (0, 1))]
+    outcome = process(write_ros1(tmp_path / 'rec.bag', entries), tmp_path / 'out', copy=True)
+    [(reason, count)] = outcome.spoilt.items()
+    assert reason.startswith('/words: no std_msgs/msg/String: ')
+    assert '\n' not in reason
+    assert count == 2
+    copied = [ROS2.deserialize_cdr(data, TEXT).data for topic, _, data in read(tmp_path / 'out') if topic == '/words']
+    assert copied == ['good']
+    assert not outcome.failed
+
+
+def test_a_recording_that_cannot_be_read_on_for_the_copies_is_a_sentence(tmp_path, monkeypatch):
+    """The images are in other chunks, which are whole."""
+    entries = [('/words', TEXT, BEGIN, text('w' * 2_000_000)), *film(3)]
+    path = write(tmp_path / 'rec', entries, mode=CompressionMode.STORAGE)
+    [file] = path.glob('*.mcap')
+    data = bytearray(file.read_bytes())
+    data[data.index(b'\x28\xb5\x2f\xfd') + 9] ^= 0xff  # in the first chunk
+    file.write_bytes(data)
+    with pytest.raises(RecordingError) as error:
+        process(path, tmp_path / 'out', copy=True)
+    assert str(path) in one_sentence(error)
     assert not (tmp_path / 'out').exists()
+
+
+def test_a_stamp_that_the_new_bag_cannot_have_is_a_sentence(tmp_path):
+    path = write(tmp_path / 'rec', [('/camera', IMAGE, 2**63 + number, image(picture())) for number in range(3)])
+    assert [frame.stamp for frame in process(path, tmp_path / 'out').frames] == [2**63 + k for k in range(3)]
+    with pytest.raises(TargetError, match='a stamp is beyond') as error:
+        process(path, tmp_path / 'other', storage='sqlite3')
+    one_sentence(error)
 
 
 # The truth
@@ -820,12 +874,40 @@ def test_resuming_with_another_recording_is_refused(source, tmp_path):
         process(path, tmp_path / 'out', resume=True)
 
 
-@pytest.mark.xfail(strict=True, reason='the path of the recording, as it was given, is among the settings')
-def test_resuming_finds_the_recording_by_another_way_to_it(source, tmp_path, monkeypatch):
+@pytest.mark.parametrize('way', ['relative', 'folder of links', 'link'])
+def test_resuming_finds_the_recording_by_another_way_to_it(source, result, tmp_path, monkeypatch, counted, way):
     with pytest.raises(Stop):
         process(source, tmp_path / 'out', watch=stopper(2))
+    counted.clear()
     monkeypatch.chdir(source.parent)
-    process(Path(source.name), tmp_path / 'out', resume=True)
+    (tmp_path / 'link').symlink_to(source)
+    (tmp_path / 'links').symlink_to(source.parent)
+    path = {'relative': Path(source.name), 'folder of links': tmp_path / 'links' / source.name,
+            'link': tmp_path / 'link'}[way]
+    process(path, tmp_path / 'out', resume=True)
+    assert len(counted) <= 2
+    assert read(tmp_path / 'out') == read(result)
+
+
+def test_resuming_what_another_version_began_is_refused(source, tmp_path, monkeypatch):
+    with pytest.raises(Stop):
+        process(source, tmp_path / 'out', watch=stopper(2))
+    monkeypatch.setattr(importlib.metadata, 'version', lambda _: '0.0.1')
+    with pytest.raises(TargetError, match='another version'):
+        process(source, tmp_path / 'out', resume=True)
+
+
+def test_workers_in_another_folder_find_the_recording(source, tmp_path, monkeypatch):
+    monkeypatch.chdir(source.parent)
+    pool = ThreadPoolExecutor(1)
+
+    @contextmanager
+    def elsewhere():
+        monkeypatch.chdir(tmp_path)
+        yield pool
+
+    process(Path(source.name), tmp_path / 'out', Workers(1, elsewhere))
+    assert len(read(tmp_path / 'out')) == 300
 
 
 def test_a_slice_that_was_half_written_is_done_again(source, result, tmp_path):

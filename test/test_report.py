@@ -12,6 +12,7 @@ from test_recordings import BEGIN, IMAGE, film, image, picture, stamp_of, write
 
 from line_feature_node.bag import Outcome, Run, TargetError, process_recording
 from line_feature_node.core import Parameters
+from line_feature_node.frames import Frames
 from line_feature_node.markup import VOID
 from line_feature_node.report import PICTURES, PICTURES_OF_TOPIC, SIDE, check_report, page, write_report
 from line_feature_node.slices import BANDS, Frame, Job
@@ -72,7 +73,7 @@ def frames(count, topic='/camera', late=5, **changes):
 
 
 def outcome(made, name='drive'):
-    return Outcome(Path(f'/somewhere/{name}.bag'), Path('/somewhere/lines'), made)
+    return Outcome(Path(f'/somewhere/{name}.bag'), Path('/somewhere/lines'), Frames(made))
 
 
 def read(*outcomes, run=RUN, profile='default'):
@@ -212,7 +213,7 @@ def test_stamps_may_be_any(stamps):
 
 def test_names_and_errors_with_markup_stay_text(tmp_path):
     some = [*frames(3, EVIL), *frames(1, EVIL, error=EVIL)]
-    evil = Outcome(tmp_path / EVIL.replace('/', ' '), tmp_path / 'out', some, error=EVIL, uncopied=[EVIL])
+    evil = Outcome(tmp_path / EVIL.replace('/', ' '), tmp_path / 'out', Frames(some), error=EVIL, uncopied=[EVIL])
     run = Run(Job(Parameters()), topics=(EVIL,))
     plain = read(outcome(frames(3)), run=run)
     for outcomes in ([evil], [evil, evil]):
@@ -272,7 +273,7 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 def test_names_that_are_no_text_can_be_written(tmp_path):
-    strange = Outcome(Path(os.fsdecode(b'/a/b\xff.bag')), tmp_path, frames(2))
+    strange = Outcome(Path(os.fsdecode(b'/a/b\xff.bag')), tmp_path, Frames(frames(2)))
     write_report(tmp_path / 'report.html', [strange], RUN, 'default', overwrite=False)
     assert 'b\\udcff.bag' in (tmp_path / 'report.html').read_text(encoding='utf-8')
 
