@@ -4,6 +4,7 @@ Beside the target there is a folder for what is under way, with a file for each 
 was killed can go on. The target is there when all of it is, by a rename.
 """
 
+import bisect
 import contextlib
 import errno
 import fcntl
@@ -15,7 +16,7 @@ import math
 import os
 import shutil
 import sqlite3
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -37,7 +38,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from line_feature_node.core import SEGMENT_DTYPE
 from line_feature_node.frames import Frames
 from line_feature_node.recordings import RecordingError, Slice, as_ros2, is_ros1, opened, plan, told, typestore
-from line_feature_node.slices import CSV, OUTPUTS, Frame, Job, process_slice, unpack
+from line_feature_node.slices import CSV, OUTPUTS, Frame, Job, process_slice, rests, unpack
 from line_feature_node.workers import Workers, in_order, inline
 
 #: What is offered with results, as the node does: reliable, of depth 5.
@@ -131,7 +132,8 @@ def process_recording(
         target: The folder of the bag.
         run: What is asked for.
         workers: Who does the work.
-        watch: Told of each frame that is done, with the number of slices and of those that are done; None for no frame.
+        watch: Told of each frame that is done, with the number of slices that are done, and of all that are known of,
+            which grows where frames come in bursts; None for no frame.
 
     Raises:
         RecordingError: The recording cannot be read.
@@ -154,10 +156,10 @@ def process_recording(
         return outcome
     with (_told(target), _Work(source, there, run, slices) as work,
           contextlib.closing(work.results(workers)) as results):
-        for number, data in enumerate(results):
-            for frame in work.write(number, unpack(data), outcome):
-                watch(number, len(slices), frame)
-            watch(number + 1, len(slices), None)
+        for done, (part, data) in enumerate(results, 1):
+            for frame in work.write(part, unpack(data), outcome):
+                watch(done - 1, done + work.left, frame)
+            watch(done, done + work.left, None)
         outcome.uncopied, outcome.spoilt = work.uncopied, work.spoilt
         work.finish()
     return outcome
@@ -194,8 +196,10 @@ class _Work:
         self._source = source
         self._stack = contextlib.ExitStack()
         self._offsets = dict.fromkeys(slices[0].topics, 0)
+        self._copied = None if run.start is None else slices[0].start  # up to where
         self.uncopied: list[str] = []
         self.spoilt: Counter[str] = Counter()
+        self.left = len(slices)
 
     def __enter__(self) -> '_Work':
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -254,47 +258,62 @@ class _Work:
                 'files': [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files],
                 'slices': [asdict(replace(part, path=Path())) for part in self._slices]}
 
-    def results(self, workers: Workers) -> Generator[bytes, None, None]:
-        """What was made of each slice, in order; what an earlier run made is taken from the journal."""
-        paths = [self._journal / f'{number:06d}' for number in range(len(self._slices))]
-        missing = [number for number, path in enumerate(paths) if not path.exists()]
+    def results(self, workers: Workers) -> Generator[tuple[Slice, bytes], None, None]:
+        """The slices, each up to where it was done, with what was made of them; some may be from the journal."""
+        pieces = deque(self._pieces())
+        missing = [(part, self._run.job) for _, part, made in pieces if not made]
         if len(missing) == 1:
             workers = inline()
-        pieces = [(self._slices[number], self._run.job) for number in missing]
-        with contextlib.closing(in_order(workers, process_slice, pieces)) as made:
-            for path in paths:
-                if path.exists():
-                    yield path.read_bytes()
-                else:
-                    data = next(made)
+        with contextlib.closing(in_order(workers, process_slice, missing, _left)) as made:
+            while pieces:
+                path, part, there = pieces.popleft()
+                data = path.read_bytes() if there else next(made)
+                left = rests(part, data)
+                if not there:
                     _write_whole(path, data)
-                    yield data
+                    pieces.extendleft((self._path(rest), rest, False) for rest in reversed(left))
+                self.left = len(pieces)
+                yield replace(part, stop=left[0].start) if left else part, data
 
-    def write(self, number: int, frames: list[Frame], outcome: Outcome) -> Iterator[Frame]:
+    def _pieces(self) -> Iterator[tuple[Path, Slice, bool]]:
+        """The slices and what is known to be left of them, in order: their place in the journal, and if it is there."""
+        parts = deque(self._slices)
+        while parts:
+            part = parts.popleft()
+            path = self._path(part)
+            made = path.exists()
+            if made:
+                parts.extendleft(reversed(rests(part, path.read_bytes())))
+            yield path, part, made
+
+    def _path(self, part: Slice) -> Path:
+        number = bisect.bisect(self._slices, part.start, key=lambda each: each.start) - 1
+        rest = '' if part == self._slices[number] else f'-{part.start}-{part.stop}-{part.after}'
+        return self._journal / f'{number:06d}{rest}'
+
+    def write(self, part: Slice, frames: list[Frame], outcome: Outcome) -> Iterator[Frame]:
         """Write what was made of a slice, and what is copied of its time, in the order of time."""
-        part = self._slices[number]
         for frame in frames:
             if not part.skipped:
                 frame.number += self._offsets[frame.topic]
         for topic in self._offsets:
             self._offsets[topic] += sum(frame.topic == topic for frame in frames)
-        self._write_messages(number, part, frames)
+        self._write_messages(part, frames)
         for frame in frames:
             self._write_text(frame)
             bare = replace(frame, messages={})
             outcome.frames.append(bare)
             yield bare
 
-    def _write_messages(self, number: int, part: Slice, frames: list[Frame]) -> None:
+    def _write_messages(self, part: Slice, frames: list[Frame]) -> None:
         made: Iterator[tuple[int, Any, Any]] = (
             (frame.stamp, self._connections[frame.topic, name], data)
             for frame in frames for name, data in frame.messages.items() if name != CSV)
         if self._copier:
             # What was before the first image, and after the last, belongs to the first and the last slice.
-            last = number == len(self._slices) - 1
-            copied = self._copier.messages(None if number == 0 and self._run.start is None else part.start,
-                                           None if last and self._run.end is None else part.stop)
-            made = heapq.merge(copied, made, key=lambda message: message[0])
+            stop = part.stop if self.left or self._run.end is not None else None
+            made = heapq.merge(self._copier.messages(self._copied, stop), made, key=lambda message: message[0])
+            self._copied = stop
         for stamp, connection, data in made:
             self._writer.write(connection, stamp, data)
 
@@ -437,6 +456,12 @@ def _hash(connection: Connection) -> str:
     types.register(get_types_from_idl(connection.msgdef.data) if idl else
                    get_types_from_msg(connection.msgdef.data, connection.msgtype))
     return types.hash_rihs01(connection.msgtype)
+
+
+def _left(piece: tuple[Slice, Job], data: bytes) -> list[tuple[Slice, Job]]:
+    """What a piece of work leaves to be done."""
+    part, job = piece
+    return [(rest, job) for rest in rests(part, data)]
 
 
 def _write_whole(path: Path, data: bytes) -> None:

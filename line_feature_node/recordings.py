@@ -40,6 +40,7 @@ class Slice:
         start, stop: Nanoseconds, the first that belongs to it and the first that no longer does.
         every: One of so many frames of a topic is processed.
         skipped: Frames of each topic that came before it, to count on from.
+        after: Messages at its beginning, in the order in which they are read, that do not belong to it.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class Slice:
     stop: int
     every: int = 1
     skipped: tuple[int, ...] = ()
+    after: int = 0
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
@@ -171,7 +173,7 @@ def as_ros2(types: Any, data: bytes, msgtype: str) -> bytes:
 def plan(
     path: Path, *, topics: list[str], start: float | None = None, end: float | None = None, every: int = 1,
 ) -> list[Slice]:
-    """Divide the images of a recording into slices of about SLICE frames; the same ones each time.
+    """Divide the images of a recording into slices of equal time, of SLICE frames on average; the same ones each time.
 
     Args:
         path: The recording.
@@ -203,7 +205,7 @@ def plan(
         share = (stop - begin) / duration
         number = max(1, math.ceil(count * share / SLICE))
         edges = [begin + (stop - begin) * k // number for k in range(number + 1)]
-        slices = [Slice(path, chosen, first, last, every) for first, last in pairwise(edges)]
+        slices = [Slice(path, chosen, first, last, every) for first, last in pairwise(edges) if first < last]
         return _counted(reader, slices) if every > 1 else slices
 
 

@@ -5,8 +5,9 @@ import json
 import struct
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from line_feature_node.core import LineFeatureExtractor, Parameters, end_points
 from line_feature_node.images import displayable, usable_pixels
 from line_feature_node.messages import Messages, segments_of
 from line_feature_node.overlay import draw_overlay, encode_jpeg
-from line_feature_node.recordings import DECODERS, Slice, deserialize, opened, typestore
+from line_feature_node.recordings import DECODERS, SLICE, Reader, Slice, deserialize, opened, typestore
 from line_feature_node.truth import compare
 
 #: What is made of a frame, by the ending of its topic, with the type of the message.
@@ -30,6 +31,10 @@ OUTPUTS = {
 TRUTH = 'truth'
 #: Name of the segments as text among the messages.
 CSV = 'csv'
+#: Frames that are processed of a slice, at most, as all their messages are kept in memory; the rest is given back, ...
+LIMIT = 2 * SLICE
+#: ... in so many parts, that several workers may share it.
+PARTS = 4
 #: Bands of orientation that lengths are summed up in.
 BANDS = 18
 #: Before a packed slice: the length of its table of contents.
@@ -92,29 +97,85 @@ def process_slice(part: Slice, job: Job) -> bytes:
     """Process the frames of a slice, in their order; the same messages whoever does it.
 
     Returns:
-        The frames, packed; only the seconds that they took differ from time to time.
+        The frames, packed, with what is left to be done where there are more than LIMIT; only the seconds that they
+        took differ from time to time.
 
     Raises:
         RecordingError: The recording cannot be read.
     """
-    return pack(list(_frames(part, job)))
-
-
-def _frames(part: Slice, job: Job) -> Iterator[Frame]:
+    frames: list[Frame] = []
+    found: list[NDArray[np.void] | None] = []
     extractor = _extractor(job.parameters)
-    numbers = dict(zip(part.topics, part.skipped or (0,) * len(part.topics), strict=True))
     with opened(part.path) as reader:
-        wanted = {*part.topics, *(f'{topic}/{TRUTH}' for topic in part.topics if job.truth)}
-        connections = [connection for connection in reader.connections if connection.topic in wanted]
-        truths = _truths(reader, connections, part) if job.truth else {}
-        images = [connection for connection in connections if connection.topic in part.topics]
-        for connection, stamp, data in reader.messages(images, part.start, part.stop):
-            number = numbers[connection.topic]
-            numbers[connection.topic] += 1
+        images = [connection for connection in reader.connections if connection.topic in part.topics]
+        rest = None
+        for step in _read(reader, images, part):
+            if len(frames) == LIMIT:
+                rest = _rest(reader, images, part, step)
+                break
+            frames.append(Frame(step.connection.topic, step.number, step.stamp))
+            found.append(_process(frames[-1], step.connection.msgtype, step.data, part.path, job, extractor))
+        if job.truth and frames:
+            _compare(reader, part, frames, found)
+    return pack(frames, rest)
+
+
+@dataclass
+class _Step:
+    """A frame that is to be processed.
+
+    Attributes:
+        connection, stamp, data: Its message.
+        number: Among the frames of its topic.
+        before: Stamps of the messages of the slice that were read before it.
+        counts: Frames of each topic before it.
+    """
+
+    connection: Any
+    stamp: int
+    data: bytes
+    number: int
+    before: list[int]
+    counts: dict[str, int]
+
+
+def _read(reader: Reader, images: list[Any], part: Slice) -> Iterator[_Step]:
+    counts = dict(zip(part.topics, part.skipped or (0,) * len(part.topics), strict=True))
+    before: list[int] = []
+    for connection, stamp, data in reader.messages(images, part.start, part.stop):
+        if len(before) >= part.after:
+            number = counts[connection.topic]
             if number % part.every == 0:
-                frame = Frame(connection.topic, number, stamp)
-                _process(frame, connection.msgtype, data, part.path, job, extractor, truths)
-                yield frame
+                yield _Step(connection, stamp, data, number, before, counts)
+            counts[connection.topic] += 1
+        before.append(stamp)
+
+
+def _rest(reader: Reader, images: list[Any], part: Slice, step: _Step) -> Slice:
+    """What is left of a slice, from a frame on.
+
+    Readers sort by time, but for recordings in several files, which may overlap: those are read from the beginning of
+    the slice again.
+    """
+    earlier = sum(stamp < step.stamp for stamp in step.before)
+    ordered = max(step.before) <= step.stamp and (
+        part.start == step.stamp or earlier == sum(1 for _ in reader.messages(images, part.start, step.stamp)))
+    skipped = tuple(step.counts.values()) if part.skipped else ()
+    if ordered:
+        return replace(part, start=step.stamp, after=len(step.before) - earlier, skipped=skipped)
+    return replace(part, after=len(step.before), skipped=skipped)
+
+
+def rests(part: Slice, data: bytes) -> list[Slice]:
+    """What is left to be done of a slice, in the order of time, from what was made of it."""
+    rest = _table(data)['rest']
+    if not rest:
+        return []
+    left = replace(part, start=rest['start'], after=rest['after'], skipped=tuple(rest['skipped']))
+    if left.after or left.skipped or left.stop - left.start < PARTS:
+        return [left]
+    edges = [left.start + (left.stop - left.start) * k // PARTS for k in range(PARTS + 1)]
+    return [replace(left, start=first, stop=last) for first, last in pairwise(edges)]
 
 
 @cache
@@ -123,21 +184,25 @@ def _extractor(parameters: Parameters) -> LineFeatureExtractor:
     return LineFeatureExtractor(parameters)
 
 
-def _truths(reader: Any, connections: list[Any], part: Slice) -> dict[tuple[str, int], NDArray[np.void]]:
-    """The true segments of the slice, by topic of the images and stamp of the recording."""
+def _compare(reader: Reader, part: Slice, frames: list[Frame], found: list[NDArray[np.void] | None]) -> None:
+    """Fill in how the segments of frames agree with the true ones of the same topic and stamp."""
+    wanted = {f'{topic}/{TRUTH}' for topic in part.topics}
+    connections = [connection for connection in reader.connections if connection.topic in wanted]
+    last = max(frame.stamp for frame in frames)
     truths = {}
-    others = [connection for connection in connections if connection.topic not in part.topics]
-    for connection, stamp, data in reader.messages(others, part.start, part.stop) if others else ():
+    for connection, stamp, data in reader.messages(connections, part.start, last + 1) if connections else ():
         with contextlib.suppress(ValueError):  # what is no truth is none to compare with
-            segments = segments_of(deserialize(part.path, data, connection.msgtype))
-            truths[connection.topic.removesuffix(f'/{TRUTH}'), stamp] = segments
-    return truths
+            truth = segments_of(deserialize(part.path, data, connection.msgtype))
+            truths[connection.topic.removesuffix(f'/{TRUTH}'), stamp] = truth
+    for frame, segments in zip(frames, found, strict=True):
+        if segments is not None and (frame.topic, frame.stamp) in truths:
+            frame.agreement = _agreement(segments, truths[frame.topic, frame.stamp])
 
 
 def _process(
-    frame: Frame, msgtype: str, data: bytes, path: Path, job: Job, extractor: LineFeatureExtractor, truths: Any,
-) -> None:
-    """Fill in what becomes of a frame; what is wrong with it is its error."""
+    frame: Frame, msgtype: str, data: bytes, path: Path, job: Job, extractor: LineFeatureExtractor,
+) -> NDArray[np.void] | None:
+    """Fill in what becomes of a frame, and return its segments; what is wrong with it is its error."""
     try:
         message = deserialize(path, data, msgtype)
         frame.header_stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
@@ -147,11 +212,9 @@ def _process(
         frame.seconds = time.perf_counter() - begin
     except (cv2.error, MemoryError, TypeError, ValueError) as error:
         frame.error = ' '.join(str(error).split()) or type(error).__name__
-        return
+        return None
     frame.segments = len(segments)
     frame.orientations = _orientations(segments)
-    if (frame.topic, frame.stamp) in truths:
-        frame.agreement = _agreement(segments, truths[frame.topic, frame.stamp])
     header = _header(message.header)
     if job.csv:
         frame.messages[CSV] = segments_as_text(segments)
@@ -161,6 +224,7 @@ def _process(
             frame.messages[name] = bytes(typestore(ros1=False).serialize_cdr(made, OUTPUTS[name]))
     except (cv2.error, MemoryError, ValueError) as error:  # an overlay that cannot be
         frame.error = ' '.join(str(error).split())
+    return segments
 
 
 def _message(name: str, image: NDArray[Any], segments: NDArray[np.void], header: Any, job: Job) -> Any:
@@ -198,8 +262,13 @@ def _agreement(segments: NDArray[np.void], truth: NDArray[np.void]) -> list[floa
     return [found.precision, found.recall, found.angle, found.offset]
 
 
-def pack(frames: list[Frame]) -> bytes:
-    """Frames in one piece: the length of a table of contents, the table as JSON, and the messages one by one."""
+def pack(frames: list[Frame], rest: Slice | None = None) -> bytes:
+    """Frames in one piece: the length of a table of contents, the table as JSON, and the messages one by one.
+
+    Args:
+        frames: They.
+        rest: What is left to be done.
+    """
     entries: list[dict[str, Any]] = []
     blobs: list[bytes] = []
     for frame in frames:
@@ -207,7 +276,8 @@ def pack(frames: list[Frame]) -> bytes:
         entry['messages'] = {name: len(data) for name, data in frame.messages.items()}
         entries.append(entry)
         blobs += frame.messages.values()
-    table = json.dumps(entries).encode()
+    left = rest and {'start': rest.start, 'after': rest.after, 'skipped': rest.skipped}
+    table = json.dumps({'frames': entries, 'rest': left}).encode()
     return b''.join([PREFIX.pack(len(table)), table, *blobs])
 
 
@@ -215,10 +285,15 @@ def unpack(data: bytes) -> list[Frame]:
     """The frames in a piece that :func:`pack` made."""
     place = PREFIX.size + PREFIX.unpack_from(data)[0]
     frames = []
-    for entry in json.loads(data[PREFIX.size:place]):
+    for entry in _table(data)['frames']:
         sizes, entry['messages'] = entry['messages'], {}
         for name, size in sizes.items():
             entry['messages'][name] = data[place:place + size]
             place += size
         frames.append(Frame(**entry))
     return frames
+
+
+def _table(data: bytes) -> dict[str, Any]:
+    table: dict[str, Any] = json.loads(data[PREFIX.size:PREFIX.size + PREFIX.unpack_from(data)[0]])
+    return table

@@ -18,10 +18,13 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from typing import Any
 
+#: Arguments of a piece of work.
+Piece = tuple[Any, ...]
 #: What the workers of a cluster must have, in the same version as here.
 PACKAGE = 'line_feature_node'
 #: How often a piece of work is given out when those who had it died.
 ATTEMPTS = 3
+KILLED = f'workers were killed {ATTEMPTS} times in a row, perhaps for want of memory'
 #: Seconds between looks at who is waited for.
 LOOK = 0.5
 #: Seconds in which a scheduler must answer, ...
@@ -111,7 +114,7 @@ class _Processes(ThreadPoolExecutor):
                 break
             self._of_thread.process = None
         else:
-            raise WorkersError(f'workers were killed {ATTEMPTS} times in a row, perhaps for want of memory')
+            raise WorkersError(KILLED)
         if error is not None:
             raise error
         return result
@@ -278,7 +281,8 @@ class _Cluster:
 
 
 def in_order(
-    workers: Workers, work: Callable[..., bytes], pieces: Iterable[tuple[Any, ...]],
+    workers: Workers, work: Callable[..., bytes], pieces: Iterable[Piece],
+    more: Callable[[Piece, bytes], list[Piece]] = lambda *_: [],
 ) -> Generator[bytes, None, None]:
     """Results of the work on each piece, in the order of the pieces; only so many at a time as keep the workers busy.
 
@@ -286,6 +290,7 @@ def in_order(
         workers: Who does it.
         work: A function that can be sent to another process.
         pieces: Its arguments.
+        more: What pieces a piece leaves to be done right after it, from its result.
 
     Raises:
         WorkersError: Those who work on a piece die again and again.
@@ -294,25 +299,29 @@ def in_order(
     remaining = deque(pieces)
     attempts = 0
     while remaining:
-        before = len(remaining)
+        attempts += 1
         with contextlib.suppress(*workers.broken), workers.make() as executor:
-            yield from _results(executor, work, remaining, workers)
-        attempts = attempts + 1 if len(remaining) == before else 0
+            for result in _results(executor, work, remaining, more, workers):
+                attempts = 0
+                yield result
         if attempts == ATTEMPTS:
-            raise WorkersError(f'workers were killed {ATTEMPTS} times in a row, perhaps for want of memory')
+            raise WorkersError(KILLED)
 
 
 def _results(
-    executor: Executor, work: Callable[..., bytes], remaining: 'deque[tuple[Any, ...]]', workers: Workers,
+    executor: Executor, work: Callable[..., bytes], remaining: 'deque[Piece]',
+    more: Callable[[Piece, bytes], list[Piece]], workers: Workers,
 ) -> Iterator[bytes]:
     """Take from what remains piece by piece, as each is done; the others are under way."""
     ahead = 2 * workers.count
     under_way: deque[Future[bytes]] = deque(executor.submit(work, *piece) for piece in list(remaining)[:ahead])
     while under_way:
         result = _result(under_way.popleft(), workers.look)
-        remaining.popleft()
+        left = more(remaining.popleft(), result)
+        remaining.extendleft(reversed(left))
         yield result  # before anything that fails when workers died, or it would be lost
-        if len(remaining) > len(under_way):
+        under_way.extendleft(reversed([executor.submit(work, *piece) for piece in left]))
+        while len(under_way) < min(ahead, len(remaining)):
             under_way.append(executor.submit(work, *remaining[len(under_way)]))
 
 

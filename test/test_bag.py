@@ -216,6 +216,78 @@ def test_every_kind_of_input_gives_the_same(result, tmp_path):
         assert read(tmp_path / f'out{number}') == read(result)
 
 
+@pytest.fixture(scope='module')
+def burst(tmp_path_factory):
+    """Frames that come in two bursts, one of them all at once, and words between them."""
+    stamps = [*(BEGIN + number * 1000 for number in range(250)), *[BEGIN + 10**11] * 150]
+    entries = []
+    for number, stamp in enumerate(stamps):
+        entries += [('/camera', IMAGE, stamp, image(picture(number % 7), number)),
+                    ('/words', TEXT, stamp, text(str(number)))]
+    return write(tmp_path_factory.mktemp('burst') / 'rec', entries)
+
+
+@pytest.fixture(scope='module')
+def burst_result(burst, tmp_path_factory):
+    target = tmp_path_factory.mktemp('burst') / 'out'
+    process(burst, target, copy=True, job=SEGMENTS)
+    return target
+
+
+def test_a_burst_has_its_results_in_order(burst, burst_result):
+    made = of(read(burst_result), '/segments')
+    headers = [ROS2.deserialize_cdr(data, CLOUD).header.stamp for _, _, data in made]
+    assert [stamp.sec * 10**9 + stamp.nanosec for stamp in headers] == [
+        stamp_of(number) - 1_000_001 for number in range(400)]
+    assert of(read(burst_result), '/words') == of(read(burst), '/words')
+
+
+@pytest.mark.parametrize('count', [1, 2])
+def test_results_of_a_burst_do_not_depend_on_the_workers(burst, burst_result, tmp_path, count):
+    outcome = process(burst, tmp_path / 'out', local(count), copy=True, job=SEGMENTS)
+    assert read(tmp_path / 'out') == read(burst_result)
+    assert [frame.number for frame in outcome.frames] == list(range(400))
+
+
+def test_a_burst_is_written_in_the_order_of_time(burst, tmp_path, monkeypatch):
+    stamps = []
+    put = Writer.write
+
+    def write_and_note(self, connection, stamp, data):
+        stamps.append(stamp)
+        put(self, connection, stamp, data)
+
+    monkeypatch.setattr(Writer, 'write', write_and_note)
+    process(burst, tmp_path / 'out', copy=True, job=SEGMENTS)
+    assert len(stamps) == 1200
+    assert stamps == sorted(stamps)
+
+
+@pytest.mark.parametrize('after', range(1, 9))
+def test_a_burst_can_be_gone_on_with(burst, burst_result, tmp_path, counted, after):
+    with pytest.raises(Stop):
+        process(burst, tmp_path / 'out', copy=True, job=SEGMENTS, watch=stopper(after))
+    stopped = len(list((tmp_path / 'out.partial' / 'slices').iterdir()))
+    counted.clear()
+    outcome = process(burst, tmp_path / 'out', copy=True, job=SEGMENTS, resume=True)
+    again = len(counted)
+    counted.clear()
+    process(burst, tmp_path / 'whole', copy=True, job=SEGMENTS)
+    assert stopped >= after
+    assert again == len(counted) - stopped
+    assert read(tmp_path / 'out') == read(burst_result)
+    assert [frame.number for frame in outcome.frames] == list(range(400))
+
+
+def test_the_progress_through_a_burst_comes_to_its_end(burst, tmp_path):
+    news = []
+    process(burst, tmp_path / 'out', job=SEGMENTS, watch=lambda *some: news.append(some))
+    done = [(done, known) for done, known, frame in news if frame is None]
+    assert [number for number, _ in done] == list(range(1, len(done) + 1))
+    assert done[-1] == (len(done), len(done))
+    assert all(number <= known for number, known in done)
+
+
 def test_the_outcome_has_every_frame(source, tmp_path):
     seen = []
     outcome = process(source, tmp_path / 'out', watch=lambda *news: seen.append(news))

@@ -590,12 +590,3 @@ def test_every_counts_from_the_start_that_was_asked_for(recording):
     slices = plan(recording, topics=[], start=0.2, every=4)
     assert slices[0].skipped == (0,)
     assert slices[-1].skipped == (len(contents(recording, None, slices[0].start, slices[-1].start)),)
-
-
-@pytest.mark.xfail(strict=True, reason='slices share out the time, not the frames: a burst is one slice')
-def test_slices_stay_small_when_frames_come_in_a_burst(tmp_path):
-    ends = [('/words', TEXT, stamp_of(number), text('a')) for number in (0, 100_000)]
-    path = write(tmp_path / 'rec', [ends[0], *film(320, first=100), ends[1]])
-    sizes = [len(contents(path, part.topics, part.start, part.stop)) for part in plan(path, topics=[])]
-    assert sum(sizes) == 320
-    assert max(sizes) <= 4 * recordings.SLICE

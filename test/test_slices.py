@@ -3,12 +3,14 @@ import dataclasses
 import importlib
 import io
 import pickle
+from collections import Counter, deque
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags.rosbag2 import Reader
 from test_recordings import (
     BEGIN,
     COMPRESSED,
@@ -25,6 +27,7 @@ from test_recordings import (
     stamp_of,
     write,
     write_ros1,
+    write_split,
 )
 
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, Parameters
@@ -33,12 +36,14 @@ from line_feature_node.overlay import COLOURS
 from line_feature_node.recordings import DECODERS, RecordingError, deserialize, find_recordings, opened, plan
 from line_feature_node.slices import (
     CSV,
+    LIMIT,
     MESSAGES,
     OUTPUTS,
     Frame,
     Job,
     pack,
     process_slice,
+    rests,
     segments_as_text,
     unpack,
 )
@@ -366,6 +371,109 @@ def test_the_bytes_of_a_slice_are_the_same_but_for_the_time_it_took(tmp_path):
     for frame in (*first, *second):
         frame.seconds = 0.0
     assert first == second
+
+
+# Bursts
+
+def pieces_of(path, job=JOB, **options):
+    """The frames of each piece of work that a recording makes."""
+    left = deque(plan(path, topics=[], **options))
+    pieces = []
+    while left:
+        part = left.popleft()
+        data = process_slice(part, job)
+        left.extendleft(reversed(rests(part, data)))
+        pieces.append(unpack(data))
+    return pieces
+
+
+def small_film(stamps, topic='/camera'):
+    """As many frames as stamps; the number of a frame is in the stamp of its header."""
+    return [(topic, IMAGE, stamp, image(picture(number % 7), number)) for number, stamp in enumerate(stamps)]
+
+
+def whole(pieces, count):
+    """Whether each frame is there once, in order, and no piece is large."""
+    some = [frame for piece in pieces for frame in piece]
+    assert max(map(len, pieces)) <= LIMIT
+    assert [frame.header_stamp for frame in some] == [stamp_of(number) - 1_000_001 for number in range(count)]
+    return some
+
+
+BURSTS = {
+    'at once': [BEGIN] * 200,
+    'nearly at once': [BEGIN + number for number in range(400)],
+    'in whole seconds': [BEGIN + number // 70 * 10**9 for number in range(300)],
+    'at the end of a long time': [BEGIN, *(BEGIN + 10**12 + number * 1000 for number in range(300))],
+    'at the beginning of a long time': [*(BEGIN + number * 1000 for number in range(300)), BEGIN + 10**12],
+    'now and then': [BEGIN + number // 150 * 10**11 + number * 1000 for number in range(600)],
+    'evenly': [stamp_of(number) for number in range(300)],
+}
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('burst', BURSTS)
+def test_frames_that_come_in_a_burst_are_done_piece_by_piece(tmp_path, burst, storage):
+    stamps = BURSTS[burst]
+    some = whole(pieces_of(write(tmp_path / 'rec', small_film(stamps), storage)), len(stamps))
+    assert [frame.stamp for frame in some] == stamps
+
+
+@pytest.mark.parametrize('burst', ['at once', 'now and then'])
+def test_bursts_of_ros1_are_done_piece_by_piece(tmp_path, burst):
+    entries = [(topic, kind, stamp, image(picture(number % 7), number, types=ROS1))
+               for number, (topic, kind, stamp, _) in enumerate(small_film(BURSTS[burst]))]
+    whole(pieces_of(write_ros1(tmp_path / 'rec.bag', entries)), len(entries))
+
+
+def test_an_even_recording_is_read_once(tmp_path, monkeypatch):
+    path = write(tmp_path / 'rec', small_film(BURSTS['evenly']))
+    readings = []
+    messages = Reader.messages
+    monkeypatch.setattr(Reader, 'messages', lambda *arguments: readings.append(arguments) or messages(*arguments))
+    pieces = pieces_of(path)
+    assert len(readings) == len(pieces) == len(plan(path, topics=[]))
+
+
+@pytest.mark.parametrize('every', [2, 3, 100])
+@pytest.mark.parametrize('burst', BURSTS)
+def test_every_takes_one_of_so_many_frames_of_a_burst(tmp_path, burst, every):
+    stamps = BURSTS[burst]
+    path = write(tmp_path / 'rec', [
+        *small_film(stamps), *((topic, kind, stamp + 1, message) for topic, kind, stamp, message
+                               in small_film(stamps, '/other'))])
+    pieces = pieces_of(path, every=every)
+    assert max(map(len, pieces)) <= LIMIT
+    for topic, offset in (('/camera', 0), ('/other', 1)):
+        mine = [frame for piece in pieces for frame in piece if frame.topic == topic]
+        assert [frame.number for frame in mine] == list(range(0, len(stamps), every))
+        assert [frame.stamp for frame in mine] == [stamp + offset for stamp in stamps[::every]]
+
+
+@pytest.mark.parametrize('cut', [10, 64, 100, 190])
+@pytest.mark.parametrize('back', [0, 5, 150])
+def test_files_of_a_recording_that_overlap_in_a_burst_lose_and_double_nothing(tmp_path, cut, back):
+    """The second file begins before the first has ended."""
+    stamps = [BEGIN + number // 2 for number in range(200)]
+    second = [BEGIN + max(0, cut - back + number) // 2 for number in range(200)]
+    path = write_split(tmp_path / 'rec', [
+        small_film(stamps), [(topic, kind, stamp, image(picture(), 1000 + number)) for number, (topic, kind, stamp, _)
+                             in enumerate(small_film(second))]])
+    pieces = pieces_of(path)
+    assert max(map(len, pieces)) <= LIMIT
+    done = Counter((frame.stamp, frame.header_stamp) for piece in pieces for frame in piece)
+    assert done == Counter(
+        [*((stamp, stamp_of(number) - 1_000_001) for number, stamp in enumerate(stamps)),
+         *((stamp, stamp_of(1000 + number) - 1_000_001) for number, stamp in enumerate(second))])
+
+
+@pytest.mark.parametrize('burst', ['nearly at once', 'now and then'])
+def test_a_burst_is_compared_with_its_truth(tmp_path, burst):
+    entries = []
+    for number, entry in enumerate(small_film(BURSTS[burst])):
+        entries += [entry, ('/camera/truth', CLOUD, entry[2], cloud(found(picture(number % 7))))]
+    some = whole(pieces_of(write(tmp_path / 'rec', entries), TRUTH), len(BURSTS[burst]))
+    assert all(frame.agreement[:2] == pytest.approx([1, 1], abs=1e-3) for frame in some)
 
 
 # Truth

@@ -156,6 +156,32 @@ def test_an_exception_of_the_work_passes_through_after_the_results_before_it():
         next(results)
 
 
+def leaves(piece, result):
+    """What is left of a number: all that are half of it or less, halved again and again."""
+    [number] = piece
+    return [(number // 2,), (number // 3,)] if number else []
+
+
+def expected(number):
+    return [double(number), *(each for [part] in leaves((number,), b'') for each in expected(part))]
+
+
+@pytest.mark.parametrize('crew', [inline(), threads(3)], ids=['inline', 'threads'])
+def test_what_a_piece_leaves_to_be_done_comes_right_after_it(crew):
+    found = list(in_order(crew, double, pieces(20), leaves))
+    assert found == [each for number in range(20) for each in expected(number)]
+
+
+def test_what_a_piece_leaves_to_be_done_is_done_when_workers_die(tmp_path):
+    results = in_order(local(2), die_and_leave, [(tmp_path, 9), (tmp_path, 5)],
+                       lambda piece, _: [(tmp_path, each) for [each] in leaves(piece[1:], b'')])
+    assert list(results) == [*expected(9), *expected(5)]
+
+
+def die_and_leave(folder, number):
+    return die_once(number, folder)
+
+
 def test_who_stops_early_does_not_have_the_rest_done():
     begun = []
 
