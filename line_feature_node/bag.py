@@ -203,10 +203,13 @@ class _Work:
 
     def __enter__(self) -> '_Work':
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._lock = os.open(self._folder / 'lock', os.O_CREAT | os.O_RDWR)
+        place = self._folder / 'lock'
+        self._lock = os.open(place, os.O_CREAT | os.O_RDWR)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+            if not os.path.samestat(os.fstat(self._lock), place.stat()):
+                raise BlockingIOError  # another run has just ended and cleared up, and yet another begun
+        except (BlockingIOError, FileNotFoundError):
             os.close(self._lock)
             raise TargetError(f'another run is writing {self._target}') from None
         try:

@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import errno
+import fcntl
 import hashlib
 import importlib.metadata
 import math
@@ -1038,6 +1039,24 @@ def test_two_runs_at_once_are_refused_by_the_lock(source, result, tmp_path):
     process(source, tmp_path / 'out', watch=watch)
     assert len(refusals) == 8
     assert read(tmp_path / 'out') == read(result)
+
+
+@pytest.mark.parametrize('anew', [False, True])
+def test_a_lock_that_was_cleared_up_meanwhile_is_none(source, tmp_path, monkeypatch, anew):
+    """Another run ends between the opening of its lock and the locking, and a third may have begun."""
+    lock = fcntl.flock
+
+    def late(file, how):
+        shutil.rmtree(tmp_path / 'out.partial')
+        if anew:
+            (tmp_path / 'out.partial').mkdir()
+            (tmp_path / 'out.partial' / 'lock').touch()
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, 'flock', late)
+    with pytest.raises(TargetError, match='another run is writing'):
+        process(source, tmp_path / 'out')
+    assert not (tmp_path / 'out').exists()
 
 
 # A full disk
