@@ -31,6 +31,8 @@ setup(
     install_requires=[
         'PyYAML>=6', 'numba>=0.58', 'numpy>=1.26', 'opencv-python-headless>=4.6', 'rich>=13', 'rosbags>=0.10',
         'typer>=0.9',
+        # For salvaging alone; rosdep does not have them.
+        'lz4>=4', 'mcap>=1.1', 'zstandard>=0.22',
     ],
     extras_require={
         # rclpy's wheel needs the extra to find a middleware.

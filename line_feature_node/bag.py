@@ -37,7 +37,17 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 
 from line_feature_node.core import SEGMENT_DTYPE
 from line_feature_node.frames import Frames
-from line_feature_node.recordings import RecordingError, Slice, as_ros2, is_ros1, opened, plan, told, typestore
+from line_feature_node.recordings import (
+    RecordingError,
+    Salvage,
+    Slice,
+    as_ros2,
+    is_ros1,
+    opened,
+    plan,
+    told,
+    typestore,
+)
 from line_feature_node.slices import CSV, OUTPUTS, Frame, Job, process_slice, rests, unpack
 from line_feature_node.workers import Workers, in_order, inline
 
@@ -102,6 +112,7 @@ class Outcome:
         error: Why nothing came of it, one sentence; '' where something did.
         uncopied: Topics that could not be copied, for want of their types.
         spoilt: How many messages could not be copied, by topic and reason.
+        salvaged: What was salvaged of the recording, where that was needed.
     """
 
     source: Path
@@ -110,6 +121,7 @@ class Outcome:
     error: str = ''
     uncopied: list[str] = field(default_factory=list)
     spoilt: Counter[str] = field(default_factory=Counter)
+    salvaged: Salvage | None = None
 
     @property
     def failed(self) -> Counter[str]:
@@ -124,6 +136,7 @@ class Outcome:
 
 def process_recording(
     source: Path, target: Path, run: Run, workers: Workers, watch: Callable[[int, int, Frame | None], None],
+    reading: Path | None = None,
 ) -> Outcome:
     """Process one recording into a bag.
 
@@ -134,6 +147,7 @@ def process_recording(
         workers: Who does the work.
         watch: Told of each frame that is done, with the number of slices that are done, and of all that are known of,
             which grows where frames come in bursts; None for no frame.
+        reading: What is read in place of the recording.
 
     Raises:
         RecordingError: The recording cannot be read.
@@ -148,13 +162,14 @@ def process_recording(
         raise TargetError(f'{target} is the folder that this is started in, or above it: name a new one')
     if there.exists() and not run.overwrite:
         raise TargetError(f'{target} exists: --overwrite replaces it')
-    slices = [replace(part, path=source.absolute())  # workers may be in other folders
-              for part in plan(source, topics=list(run.topics), start=run.start, end=run.end, every=run.every)]
+    reading = reading or source
+    slices = [replace(part, path=reading.absolute())  # workers may be in other folders
+              for part in plan(reading, topics=list(run.topics), start=run.start, end=run.end, every=run.every)]
     outcome = Outcome(source, target)
     if not slices:
         outcome.error = NO_IMAGES
         return outcome
-    with (_told(target), _Work(source, there, run, slices) as work,
+    with (_told(target), _Work(reading, there, run, slices) as work,
           contextlib.closing(work.results(workers)) as results):
         for done, (part, data) in enumerate(results, 1):
             for frame in work.write(part, unpack(data), outcome):
@@ -163,6 +178,12 @@ def process_recording(
         outcome.uncopied, outcome.spoilt = work.uncopied, work.spoilt
         work.finish()
     return outcome
+
+
+def partial_folder(target: Path) -> Path:
+    """The folder for what is under way, beside the target."""
+    there = Path(os.path.realpath(target))
+    return there.with_name(f'{there.name}.partial')
 
 
 @contextlib.contextmanager
@@ -187,7 +208,7 @@ class _Work:
         self._target = target
         self._run = run
         self._slices = slices
-        self._folder = target.with_name(f'{target.name}.partial')
+        self._folder = partial_folder(target)
         self._journal = self._folder / 'slices'
         self._replaced = self._folder / 'replaced'
         self._bag = self._folder / 'bag' / target.name  # the file in it has the name of its folder

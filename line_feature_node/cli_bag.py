@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from line_feature_node.bag import NO_IMAGES, Outcome, Run, TargetError, process_recording
+from line_feature_node.bag import NO_IMAGES, Outcome, Run, TargetError, partial_folder, process_recording
 from line_feature_node.cli_options import console, errors, fail
 from line_feature_node.core import Parameters
 from line_feature_node.files import read_mask, unique_names
 from line_feature_node.options import Options
-from line_feature_node.recordings import RecordingError, find_recordings
+from line_feature_node.recordings import DamagedError, RecordingError, find_recordings
 from line_feature_node.report import check_report, write_report
 from line_feature_node.slices import OUTPUTS, Frame, Job
 from line_feature_node.workers import Workers, WorkersError, cluster, local
@@ -56,6 +56,7 @@ def bag(
     report: Annotated[Optional[Path], typer.Option(help='Write a page (HTML) about the run.')] = None,
     workers: Annotated[Optional[int], typer.Option(min=1, help='Processes; as many as processors.')] = None,
     scheduler: Annotated[Optional[str], typer.Option(help='Dask scheduler instead, tcp://host:port.')] = None,
+    salvage: Annotated[bool, typer.Option('--salvage', help='Process what precedes a cut or damage.')] = False,
     resume: Annotated[bool, typer.Option('--resume', help='Go on from what an interrupted run left.')] = False,
     overwrite: Annotated[bool, typer.Option('--overwrite', help='Replace what is there.')] = False,
     quiet: Annotated[bool, typer.Option('--quiet', help='Only errors are printed.')] = False,
@@ -63,8 +64,8 @@ def bag(
 ) -> None:
     """Extract the segments of recordings into new bags: segments, markers and overlays beside the stamps of the images.
 
-    Ends with status 0 when all went well, 1 when some frames, copies or recordings failed, and 2 when nothing could
-    be read.
+    Ends with status 0 when all went well, 1 when some frames, copies or recordings failed or part of one was salvaged,
+    and 2 when nothing could be read.
     """
     if storage not in ('mcap', 'sqlite3'):
         raise typer.BadParameter(f'storage must be mcap or sqlite3, got {storage!r}')
@@ -86,7 +87,7 @@ def bag(
     try:
         with _interruptible():
             for source, target in pairs:
-                outcomes.append(_process(source, target, run, crew, quiet=quiet or as_json))
+                outcomes.append(_process(source, target, run, crew, quiet=quiet or as_json, salvage=salvage))
     except _Interrupted as error:
         errors.print(f'{error.number.name}: ended before all was done; --resume goes on from there', markup=False)
         raise typer.Exit(INTERRUPTED[error.number]) from None
@@ -117,22 +118,50 @@ def _targets(sources: list[Path], out: Path) -> Iterator[tuple[Path, Path]]:
         yield source, out / name
 
 
-def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool) -> Outcome:
+def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool, salvage: bool) -> Outcome:
     """Process a recording with a progress bar; what goes wrong with all of it is a line on standard error."""
     try:
-        with _progress(source.name, quiet=quiet) as watch:
-            outcome = process_recording(source, target, run, crew, watch)
+        outcome = _read(source, target, run, crew, quiet=quiet, salvage=salvage)
     except (RecordingError, TargetError, WorkersError) as error:
         outcome = Outcome(source, target, error=str(error))
     if outcome.error:
         errors.print(outcome.error if outcome.frames or str(source) in outcome.error else f'{source}: {outcome.error}',
                      markup=False)
+    if outcome.salvaged:
+        errors.print(f'{source}: {outcome.salvaged}', markup=False)
     for reason, count in outcome.failed.most_common():
         errors.print(f'{source}: {count} frames failed: {reason}', markup=False)
     if outcome.uncopied:
         errors.print(f'{source}: not copied, for want of their types: {", ".join(outcome.uncopied)}', markup=False)
     for reason, count in outcome.spoilt.most_common():
         errors.print(f'{source}: {count} messages not copied: {reason}', markup=False)
+    return outcome
+
+
+def _read(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool, salvage: bool) -> Outcome:
+    """Process a recording as it is or, if that cannot be and is asked for, what can be salvaged of it."""
+    try:
+        from line_feature_node.salvage import may_help, salvaged, was_salvaged
+    except ImportError:
+        if salvage:
+            fail('--salvage needs the Python packages lz4, mcap and zstandard: pip install lz4 mcap zstandard')
+        with _progress(source.name, quiet=quiet) as watch:
+            return process_recording(source, target, run, crew, watch)
+    place = partial_folder(target)
+    if not (salvage and run.resume and was_salvaged(place)):
+        try:
+            with _progress(source.name, quiet=quiet) as watch:
+                return process_recording(source, target, run, crew, watch)
+        except DamagedError as error:
+            if not salvage:
+                hint = ': --salvage processes what can still be read' if may_help(source) else ''
+                raise RecordingError(f'{error}{hint}') from error
+    with salvaged(source, place) as found, _progress(source.name, quiet=quiet) as watch:
+        try:
+            outcome = process_recording(source, target, run, crew, watch, reading=found.path)
+        except RecordingError as error:
+            raise RecordingError(str(error).replace(str(found.path), str(source))) from error
+    outcome.salvaged = found
     return outcome
 
 
@@ -186,7 +215,8 @@ def _status(outcomes: list[Outcome]) -> int:
     failed = sum(outcome.failed.total() for outcome in outcomes)
     if failed and failed == sum(len(outcome.frames) for outcome in outcomes):
         return 2
-    return 1 if unread or failed or any(outcome.uncopied or outcome.spoilt for outcome in outcomes) else 0
+    partly = any(outcome.uncopied or outcome.spoilt or outcome.salvaged for outcome in outcomes)
+    return 1 if unread or failed or partly else 0
 
 
 def _empty(outcome: Outcome) -> bool:
@@ -199,6 +229,9 @@ def _summary(outcome: Outcome) -> dict[str, Any]:
         'source': str(outcome.source), 'target': str(outcome.target), 'error': outcome.error,
         'frames': len(outcome.frames), 'failed': dict(outcome.failed), 'segments': outcome.segments,
     }
+    if outcome.salvaged:
+        summary['salvaged'] = {'messages': outcome.salvaged.messages, 'until': outcome.salvaged.until,
+                               'damage': list(outcome.salvaged.damage)}
     if outcome.uncopied or outcome.spoilt:
         summary['uncopied'] = {'topics': outcome.uncopied, 'messages': dict(outcome.spoilt)}
     compared = outcome.frames.table[outcome.frames.table['compared']]
@@ -225,6 +258,8 @@ def _table(outcome: Outcome) -> Table:
     table.add_row('frames', str(len(outcome.frames)))
     table.add_row('of them failed', str(len(outcome.frames) - len(good)))
     table.add_row('segments', str(outcome.segments))
+    if outcome.salvaged:
+        table.add_row('messages salvaged', str(outcome.salvaged.messages))
     if len(good):
         table.add_row('extraction of a frame (median)', f'{np.median(good["seconds"]) * 1e3:.2f} ms')
     agreement = _summary(outcome).get('truth')

@@ -20,6 +20,8 @@ DECODERS = {'sensor_msgs/msg/Image': image_of, 'sensor_msgs/msg/CompressedImage'
 #: Files that are recordings, or parts of one.
 SUFFIXES = ('.bag', '.db3', '.mcap')
 METADATA = 'metadata.yaml'
+#: Things wrong with a recording that are told of; there may be one a chunk.
+TOLD = 3
 #: Frames in a slice, about: few enough to be kept in memory, enough to be worth opening the recording for.
 SLICE = 32
 
@@ -28,6 +30,10 @@ Reader = Reader1 | Reader2
 
 class RecordingError(ValueError):
     """A recording cannot be read; the message is a sentence for users."""
+
+
+class DamagedError(RecordingError):
+    """What is in the files of a recording makes no sense."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,30 @@ class Slice:
     every: int = 1
     skipped: tuple[int, ...] = ()
     after: int = 0
+
+
+@dataclass(frozen=True)
+class Salvage:
+    """What was salvaged of a recording.
+
+    Attributes:
+        path: The clean recording.
+        messages: How many it has.
+        begin, until: Stamps of its first and its last message, nanoseconds.
+        damage: What is wrong with the recording, in a few words each.
+    """
+
+    path: Path
+    messages: int
+    begin: int
+    until: int
+    damage: tuple[str, ...]
+
+    def __str__(self) -> str:
+        wrong = '; '.join(self.damage[:TOLD]) or 'only its index or metadata is damaged'
+        more = f' and {len(self.damage) - TOLD} more' if len(self.damage) > TOLD else ''
+        return (f'salvaged {self.messages} messages, until {(self.until - self.begin) / 1e9:.2f} s after the first '
+                f'(stamp {self.until / 1e9:.3f}): {wrong}{more}')
 
 
 def find_recordings(paths: list[Path]) -> list[Path]:
@@ -94,7 +124,8 @@ def opened(path: Path) -> Iterator[Reader]:
     Only the types of images are needed from it, which are known: definitions that it lacks or has wrong do not matter.
 
     Raises:
-        RecordingError: It cannot be read, or what is read of it in the block makes no sense.
+        RecordingError: It cannot be read.
+        DamagedError: What is read of it, in the block too, makes no sense.
     """
     if path.is_file() and path.stat().st_size == 0:
         raise RecordingError(f'{path}: the file is empty')
@@ -116,10 +147,10 @@ def told(path: Path) -> Iterator[None]:
     except (RecordingError, GeneratorExit):
         raise
     except OSError as error:
-        raise RecordingError(f'{path}: {error.strerror or error}') from error
+        raise DamagedError(f'{path}: {error.strerror or error}') from error
     except Exception as error:
         # Whatever the library makes of bytes that are noise: its own errors, and those of what it is built on.
-        raise RecordingError(f'{path}: cannot be read ({_reason(error)})') from error
+        raise DamagedError(f'{path}: cannot be read ({_reason(error)})') from error
 
 
 def _reason(error: Exception) -> str:
