@@ -1,5 +1,5 @@
-# make install, demo, test, test-all, lint, colcon, bench, bench-node: everything goes into .venv, or .venv-3.10 and so on for
-# test-all; nothing asks anything.
+# make install, demo, test, test-all, lint, colcon, bench, bench-node, bench-bag: everything goes into .venv, or
+# .venv-3.10 and so on for test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -19,7 +19,7 @@ PEERS := .venv-peers
 #   D417            arguments that belong together are described together
 PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
 
-.PHONY: install demo test test-all lint colcon bench bench-node docs clean
+.PHONY: install demo test test-all lint colcon bench bench-node bench-bag docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -50,6 +50,10 @@ bench: $(PEERS)/.installed
 # Latency, loss and load of the node beside those of an empty one, and five minutes of it as a curve.
 bench-node: $(PEERS)/.installed
 	$(PEERS)/bin/python bench/node.py --soak 5 --results bench/results
+
+# Frames a second of the offline run over recordings beside the bare extractor, and its memory.
+bench-bag: install
+	$(BIN)/python bench/bag.py --results bench/results
 
 # The tables in the README, the files of config/, and the pictures in docs/.
 docs: install

@@ -60,7 +60,8 @@ class Case:
     frames: int
 
 
-CASES = (Case('640×480 mono8', 640, 480, jpeg=False, frames=400), Case('640×480 bgr8 JPEG', 640, 480, jpeg=True, frames=400),
+CASES = (Case('640×480 mono8', 640, 480, jpeg=False, frames=400),
+         Case('640×480 bgr8 JPEG', 640, 480, jpeg=True, frames=400),
          Case('1920×1080 mono8', 1920, 1080, jpeg=False, frames=100))
 
 
@@ -195,7 +196,8 @@ def show(case: Case, found: dict[str, Any]) -> None:
     for name, row in found.items():
         line = f'{name:26}{1 / row["clock"]:10.0f}{alone["clock"] / row["clock"]:8.2f}{row["cpu"] / alone["cpu"]:8.2f}'
         if 'start' in row:
-            line += f'{row["start"]:10.2f}{1 / row["whole"]:11.0f}{row["memory, short"]:11.0f}{row["memory, long"]:7.0f}'
+            line += f'{row["start"]:10.2f}{1 / row["whole"]:11.0f}'
+            line += f'{row["memory, short"]:11.0f}{row["memory, long"]:7.0f}'
         print(line)
 
 

@@ -1,6 +1,7 @@
 """Recordings of ROS 1 and ROS 2 as they lie on disk: found, opened, and divided into slices of time."""
 
 import math
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -127,12 +128,57 @@ def opened(path: Path) -> Iterator[Reader]:
         RecordingError: It cannot be read.
         DamagedError: What is read of it, in the block too, makes no sense.
     """
+    with told(path), _reader(path) as reader:
+        yield reader
+
+
+@contextmanager
+def kept_open(path: Path) -> Iterator[Reader]:
+    """As :func:`opened`, but it stays open for this thread until that asks for another one, or for the changed file.
+
+    To open a recording takes longer the longer it is, as its index is read; a slice of it does not.
+    """
+    with told(path):
+        state = _state(path)
+        kept: _Kept | None = getattr(_OF_THREAD, 'kept', None)
+        if kept is None or kept.state != state:
+            _OF_THREAD.kept = None
+            kept = _OF_THREAD.kept = _Kept(state, _reader(path))
+        try:
+            yield kept.reader
+        except BaseException:
+            _OF_THREAD.kept = None
+            raise
+
+
+_OF_THREAD = threading.local()
+
+
+class _Kept:
+    """A recording that is open until it is forgotten."""
+
+    def __init__(self, state: object, reader: Reader) -> None:
+        reader.open()
+        self.state, self.reader = state, reader
+
+    def __del__(self) -> None:
+        if hasattr(self, 'reader'):
+            self.reader.close()
+
+
+def _state(path: Path) -> object:
+    """Which files a recording has, and which versions of them."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    stats = [file.stat() for file in files]
+    return path, [(file, stat.st_ino, stat.st_size, stat.st_mtime_ns) for file, stat in zip(files, stats, strict=True)]
+
+
+def _reader(path: Path) -> Reader:
     if path.is_file() and path.stat().st_size == 0:
         raise RecordingError(f'{path}: the file is empty')
     if path.is_file() and path.suffix not in SUFFIXES:
         raise RecordingError(f'{path}: not a recording, expected one of {", ".join(SUFFIXES)} or a folder')
-    with told(path), (Reader1(path) if is_ros1(path) else Reader2(path)) as reader:
-        yield reader
+    return Reader1(path) if is_ros1(path) else Reader2(path)
 
 
 @contextmanager
@@ -140,7 +186,7 @@ def told(path: Path) -> Iterator[None]:
     """Make a sentence of what a library says of a recording.
 
     Raises:
-        RecordingError: It cannot be read.
+        DamagedError: It cannot be read.
     """
     try:
         yield
@@ -182,8 +228,8 @@ def deserialize(path: Path, data: bytes, msgtype: str) -> Any:
     """
     try:
         if is_ros1(path):
-            return typestore(ros1=True).deserialize_ros1(data, msgtype)
-        return typestore(ros1=False).deserialize_cdr(data, msgtype)
+            return typestore(ros1=True).deserialize_ros1(memoryview(data), msgtype)
+        return typestore(ros1=False).deserialize_cdr(memoryview(data), msgtype)
     except Exception as error:
         # The code that the library generates for a type reads on, and fails in as many ways as bytes can be wrong.
         raise ValueError(f'{len(data)} bytes that are no {msgtype}: {_reason(error)}') from error

@@ -388,6 +388,8 @@ def _section(recording: Recording, run: Run, shares: _Shares) -> Markup:
     if recording.begin is not None:
         facts += [('new bag', str(outcome.target)), ('first frame', _date(recording.begin)),
                   ('duration', _duration(recording.duration))]
+    if outcome.salvaged:
+        facts.append(('damaged', str(outcome.salvaged)))
     if outcome.uncopied:
         facts.append(('not copied', f'{", ".join(outcome.uncopied)}: their types are missing'))
     parts = [tag('h2', outcome.source.name, id=recording.anchor),

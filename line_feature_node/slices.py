@@ -5,7 +5,7 @@ import json
 import struct
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,7 @@ from line_feature_node.core import LineFeatureExtractor, Parameters, end_points
 from line_feature_node.images import displayable, usable_pixels
 from line_feature_node.messages import Messages, segments_of
 from line_feature_node.overlay import draw_overlay, encode_jpeg
-from line_feature_node.recordings import DECODERS, SLICE, Reader, Slice, deserialize, opened, typestore
+from line_feature_node.recordings import DECODERS, SLICE, Reader, Slice, deserialize, kept_open, typestore
 from line_feature_node.truth import compare
 
 #: What is made of a frame, by the ending of its topic, with the type of the message.
@@ -106,7 +106,7 @@ def process_slice(part: Slice, job: Job) -> bytes:
     frames: list[Frame] = []
     found: list[NDArray[np.void] | None] = []
     extractor = _extractor(job.parameters)
-    with opened(part.path) as reader:
+    with kept_open(part.path) as reader:
         images = [connection for connection in reader.connections if connection.topic in part.topics]
         rest = None
         for step in _read(reader, images, part):
@@ -249,10 +249,8 @@ def _header(header: Any) -> Any:
 
 
 def _orientations(segments: NDArray[np.void]) -> list[float]:
-    degrees = np.degrees(segments['theta'].astype(float))
-    edges = np.linspace(-90, 90, BANDS + 1)
-    lengths, _ = np.histogram(np.clip(degrees, -90, 90), edges, weights=segments['length'].astype(float))
-    return [round(float(length), 1) for length in lengths]
+    bands = np.floor((segments['theta'] / np.pi + 0.5) * BANDS).clip(0, BANDS - 1).astype(int)
+    return [round(float(length), 1) for length in np.bincount(bands, segments['length'], BANDS)]
 
 
 def _agreement(segments: NDArray[np.void], truth: NDArray[np.void]) -> list[float]:
@@ -272,7 +270,7 @@ def pack(frames: list[Frame], rest: Slice | None = None) -> bytes:
     entries: list[dict[str, Any]] = []
     blobs: list[bytes] = []
     for frame in frames:
-        entry = asdict(frame)
+        entry = dict(vars(frame))
         entry['messages'] = {name: len(data) for name, data in frame.messages.items()}
         entries.append(entry)
         blobs += frame.messages.values()

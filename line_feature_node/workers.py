@@ -18,6 +18,8 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from typing import Any
 
+import cv2
+
 #: Arguments of a piece of work.
 Piece = tuple[Any, ...]
 #: What the workers of a cluster must have, in the same version as here.
@@ -171,6 +173,7 @@ def _begin() -> None:
     """Let a worker end with its parent, however that ends, and leave signals of the terminal to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+    cv2.setNumThreads(1)  # there are as many workers as processors
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()

@@ -1,6 +1,7 @@
 """Recordings that these tests write themselves, and, where they are beside the project, some of the outside world."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,11 +16,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from line_feature_node import recordings
 from line_feature_node.recordings import (
+    DamagedError,
     RecordingError,
     deserialize,
     find_recordings,
     image_topics,
     is_ros1,
+    kept_open,
     opened,
     plan,
 )
@@ -468,6 +471,60 @@ def test_recordings_of_the_world_are_planned_whole():
                       if connection.topic in image_topics(reader)}
         assert partition(slices)
         assert {topic: len(found) for topic, found in stamps.items()} == {k: v for k, v in counts.items() if v}
+
+
+# Kept open
+
+def kept(path):
+    with kept_open(path) as reader:
+        return reader, [(connection.topic, stamp, bytes(data)) for connection, stamp, data in reader.messages()]
+
+
+@pytest.mark.parametrize('kind', ['ros1', 'mcap', 'sqlite3', 'lone'])
+def test_a_recording_that_is_kept_open_is_opened_once(tmp_path, kind):
+    path = (write_ros1(tmp_path / 'rec.bag', film(8, types=ROS1)) if kind == 'ros1' else
+            lone(write(tmp_path / 'rec', film(8)), tmp_path / 'rec.mcap') if kind == 'lone' else
+            write(tmp_path / 'rec', film(8), kind))
+    first, found = kept(path)
+    again, same = kept(path)
+    assert first is again
+    assert found == same == contents(path)
+
+
+def test_only_one_is_kept_open(tmp_path):
+    paths = [lone(write(tmp_path / f'{number}', film(2 + number)), tmp_path / f'{number}.mcap') for number in range(2)]
+    first, _ = kept(paths[0])
+    assert first.is_open
+    second, found = kept(paths[1])
+    assert (first.is_open, second.is_open) == (False, True)
+    assert len(found) == 3
+
+
+def test_a_recording_that_changed_is_opened_anew(tmp_path):
+    path = lone(write(tmp_path / 'first', film(2)), tmp_path / 'rec.mcap')
+    assert len(kept(path)[1]) == 2
+    lone(write(tmp_path / 'second', film(3)), path)
+    assert len(kept(path)[1]) == 3
+
+
+def test_one_that_failed_is_not_kept(tmp_path):
+    path = lone(write(tmp_path / 'rec', film(2)), tmp_path / 'rec.mcap')
+    with pytest.raises(DamagedError, match=r'rec\.mcap: cannot be read \(noise\)'), kept_open(path) as reader:
+        raise AssertionError('noise')
+    assert not reader.is_open
+    assert len(kept(path)[1]) == 2
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(DamagedError, match=r'rec\.mcap: cannot be read'):
+        kept(path)
+
+
+def test_each_thread_keeps_its_own(tmp_path):
+    path = write(tmp_path / 'rec', film(2), 'sqlite3')
+    with ThreadPoolExecutor(1) as pool:
+        other, _ = pool.submit(kept, path).result()
+        assert other.is_open
+        assert kept(path)[0] is not other
+    assert not other.is_open
 
 
 # Planning
