@@ -170,17 +170,23 @@ def resident(pid: int) -> int:
 def one_round(case: Case, folder: Path, made: list[bytes], extractor: LineFeatureExtractor) -> dict[str, Any]:
     """All contestants in turn."""
     short, long = folder / f'{case.name}-short', folder / f'{case.name}-long'
-    more = case.frames * (LONG - 1)
     result: dict[str, Any] = {**bare(case, made, extractor), 'reading': timed(lambda: reading(long))}
     for everything in (False, True):
         for workers in dict.fromkeys((1, len(os.sched_getaffinity(0)))):
             some, all_ = (run(path, workers, everything=everything) for path in (short, long))
             result[f'{"everything" if everything else "segments"}, {workers}'] = {
-                **{key: (all_[key] - some[key]) / more for key in ('clock', 'cpu')},
-                'start': some['clock'] - (all_['clock'] - some['clock']) / (LONG - 1),
-                'whole': all_['clock'] / (case.frames * LONG),
-                'memory, short': some['memory'], 'memory, long': all_['memory']}
+                **{f'{key}, short': value for key, value in some.items()},
+                **{f'{key}, long': value for key, value in all_.items()}}
     return result
+
+
+def with_rates(case: Case, row: dict[str, float]) -> dict[str, float]:
+    """What follows from the times of a run: seconds for each further frame, and those that are there without any."""
+    if 'clock, long' not in row:
+        return row
+    slopes = {key: (row[f'{key}, long'] - row[f'{key}, short']) / (case.frames * (LONG - 1)) for key in ('clock', 'cpu')}
+    return {**row, **slopes, 'start': row['clock, short'] - case.frames * slopes['clock'],
+            'whole': row['clock, long'] / (case.frames * LONG)}
 
 
 def medians(rounds: list[dict[str, Any]]) -> dict[str, Any]:
@@ -221,7 +227,7 @@ def main() -> None:
                 record(folder / f'{case.name}-{ending}', case, made, frames)
             bare(case, made, extractor)  # memory and kernels are there from now on
             rounds = [one_round(case, folder, made, extractor) for _ in range(options.rounds)]
-            results[case.name] = medians(rounds)
+            results[case.name] = {name: with_rates(case, row) for name, row in medians(rounds).items()}
             show(case, results[case.name])
     if options.results:
         options.results.mkdir(parents=True, exist_ok=True)

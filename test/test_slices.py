@@ -4,6 +4,7 @@ import importlib
 import io
 import pickle
 from collections import Counter, deque
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,6 +31,7 @@ from test_recordings import (
     write_split,
 )
 
+from line_feature_node.bag import Run, process_recording
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, Parameters
 from line_feature_node.messages import segments_of
 from line_feature_node.overlay import COLOURS
@@ -47,8 +49,10 @@ from line_feature_node.slices import (
     segments_as_text,
     unpack,
 )
+from line_feature_node.workers import inline
 
 JOB = Job(Parameters())
+SAMPLES = Path(__file__).resolve().parents[1] / 'bags'
 
 
 def frames_of(path, job=JOB, topics=(), **options):
@@ -664,3 +668,33 @@ def test_the_node_makes_the_same_messages_of_recordings_of_the_world(bench, name
     good, *results = played(bench, path, topic, kind, **parameters)
     assert sum(frame.segments for frame in good) > 20
     equal_to_the_bit(good, *results)
+
+
+@pytest.mark.parametrize('name', ['corridor', 'road'])
+def test_the_node_and_the_offline_run_give_the_same_bytes(bench, tmp_path, name):
+    """From the bytes of a sample recording to those of its new bag, with nothing of ours between them and ROS."""
+    source, target = SAMPLES / name, tmp_path / 'out'
+    process_recording(source, target, Run(Job(Parameters(), outputs=('segments',)), end=2.0), inline(), lambda *_: None)
+    camera = bench.camera('/image/compressed', ros_type(COMPRESSED))
+    node = bench.node(image_transport='compressed',
+                      **{'qos_overrides./image/compressed.subscription.reliability': 'reliable'})
+    live = bench.listen('/line_feature_node/segments', ros_type(CLOUD), depth=100)
+    frames = read_by_ros(source, COMPRESSED)[:20]
+    bench.show(camera, node, *frames)
+    bench.until(lambda: len(live) == len(frames), 'all segments')
+    offline = read_by_ros(target, CLOUD)
+    assert len(live) == len(offline) == len(frames) == 20
+    for frame, one, other in zip(frames, live, offline, strict=True):
+        assert one.width > 50
+        assert bytes(one.data) == bytes(other.data)
+        assert one.header == other.header == frame.header
+        assert one == other
+
+
+def read_by_ros(path, kind):
+    """The messages of a type in a recording, made by ROS 2 itself of their bytes."""
+    serialization = importlib.import_module('rclpy.serialization')
+    with opened(path) as reader:
+        connections = [connection for connection in reader.connections if connection.msgtype == kind]
+        return [serialization.deserialize_message(bytes(data), ros_type(kind))
+                for _, _, data in reader.messages(connections)]
