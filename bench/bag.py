@@ -184,7 +184,8 @@ def with_rates(case: Case, row: dict[str, float]) -> dict[str, float]:
     """What follows from the times of a run: seconds for each further frame, and those that are there without any."""
     if 'clock, long' not in row:
         return row
-    slopes = {key: (row[f'{key}, long'] - row[f'{key}, short']) / (case.frames * (LONG - 1)) for key in ('clock', 'cpu')}
+    more = case.frames * (LONG - 1)
+    slopes = {key: (row[f'{key}, long'] - row[f'{key}, short']) / more for key in ('clock', 'cpu')}
     return {**row, **slopes, 'start': row['clock, short'] - case.frames * slopes['clock'],
             'whole': row['clock, long'] / (case.frames * LONG)}
 

@@ -153,9 +153,10 @@ def _read(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool, s
             with _progress(source.name, quiet=quiet) as watch:
                 return process_recording(source, target, run, crew, watch)
         except DamagedError as error:
+            if not may_help(source):
+                raise
             if not salvage:
-                hint = ': --salvage processes what can still be read' if may_help(source) else ''
-                raise RecordingError(f'{error}{hint}') from error
+                raise RecordingError(f'{error}: --salvage processes what can still be read') from error
     with salvaged(source, place) as found, _progress(source.name, quiet=quiet) as watch:
         try:
             outcome = process_recording(source, target, run, crew, watch, reading=found.path)

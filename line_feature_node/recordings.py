@@ -34,7 +34,7 @@ class RecordingError(ValueError):
 
 
 class DamagedError(RecordingError):
-    """What is in the files of a recording makes no sense."""
+    """What is in the files of a recording makes no sense, or the name is that of one that was not finished."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _reader(path: Path) -> Reader:
     if path.is_file() and path.stat().st_size == 0:
         raise RecordingError(f'{path}: the file is empty')
     if path.is_file() and path.suffix not in SUFFIXES:
-        raise RecordingError(f'{path}: not a recording, expected one of {", ".join(SUFFIXES)} or a folder')
+        raise DamagedError(f'{path}: not a recording, expected one of {", ".join(SUFFIXES)} or a folder')
     return Reader1(path) if is_ros1(path) else Reader2(path)
 
 

@@ -1,4 +1,4 @@
-"""What others read of the bags that are written: the readers of mcap of PyPI and npm, and what rosbag2 wants to find."""
+"""What others read of the bags that are written: readers of mcap of PyPI and npm, and what rosbag2 wants to find."""
 
 import base64
 import json

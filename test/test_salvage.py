@@ -269,6 +269,24 @@ def test_one_that_is_damaged_in_the_middle_is_processed_without_that(tmp_path, b
     assert 40 <= len(messages(tmp_path / 'out')) < len(messages(CORRIDOR)) // 2
 
 
+def test_what_ros_1_had_not_finished_is_salvaged(tmp_path):
+    path = make(tmp_path, 'ros1').rename(tmp_path / 'drive.bag.active')
+    cut(path, 0.8)
+    assert '--salvage' in run(path, '--out', tmp_path / 'out').stderr
+    result = run(path, '--out', tmp_path / 'out', '--salvage', '--only-segments', '--quiet')
+    assert result.exit_code == 1
+    assert 20 <= len(messages(tmp_path / 'out')) < 40
+
+
+@pytest.mark.parametrize('name', ['none.bag', 'none.mcap', 'none.db3', 'none.txt'])
+def test_of_what_cannot_be_salvaged_it_is_said_what_is_wrong(tmp_path, name):
+    (tmp_path / name).write_bytes(b'version https://git-lfs.github.com/spec/v1')
+    results = [run(tmp_path / name, '--out', tmp_path / 'out', *more) for more in ((), ('--salvage',))]
+    assert [result.exit_code for result in results] == [2, 2]
+    assert results[0].stderr == results[1].stderr
+    assert '--salvage' not in results[0].stderr
+
+
 def test_good_recordings_are_processed_as_ever(tmp_path):
     result = run(CORRIDOR, '--out', tmp_path / 'out', '--end', 0.5, '--salvage', '--json')
     assert (result.exit_code, result.stderr) == (0, '')
