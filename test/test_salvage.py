@@ -5,19 +5,24 @@ import json
 import resource
 import sys
 import tracemalloc
+from pathlib import Path
 
 import pytest
 import yaml
 from rosbags.rosbag2 import CompressionMode
-from test_bag import CORRIDOR, SEGMENTS_ONLY, interrupted, messages
 from test_cli_bag import run
 from test_recordings import ROS1, contents, film, lone, stamp_of, text, write, write_ros1, write_split
 
 from line_feature_node import bag
 from line_feature_node.bag import Run, partial_folder, process_recording
+from line_feature_node.core import Parameters
 from line_feature_node.recordings import RecordingError, opened
 from line_feature_node.salvage import MARK, may_help, salvaged, was_salvaged
+from line_feature_node.slices import Job
 from line_feature_node.workers import inline
+
+CORRIDOR = Path(__file__).resolve().parents[1] / 'bags' / 'corridor'
+SEGMENTS_ONLY = Job(Parameters(), outputs=('segments',))
 
 
 def cut(path, share=0.7):
@@ -216,11 +221,16 @@ def test_the_sentence_names_some_damages_only(tmp_path):
     for path in storages(source)[1:]:
         path.unlink()
     with salvaged(source, tmp_path / 'place') as found:
-        assert messages(found.path) == contents(found.path)
         assert str(found).endswith('_3.mcap is missing, or no recording and 2 more')
 
 
 # The command
+
+def interrupted(done, slices, frame):
+    """Stop after the first slice."""
+    if frame is None:
+        raise KeyboardInterrupt
+
 
 @pytest.fixture
 def broken(tmp_path):
@@ -243,7 +253,7 @@ def test_a_cut_recording_is_processed_up_to_the_cut_with_status_1(tmp_path, brok
     assert summary['salvaged']['messages'] - 2 * summary['frames'] in (0, -1)  # the last one may be without its truth
     assert summary['error'] == ''
     assert run(CORRIDOR, '--out', tmp_path / 'whole', '--only-segments', '--quiet').exit_code == 0
-    assert messages(tmp_path / 'out') == messages(tmp_path / 'whole')[:summary['frames']]
+    assert contents(tmp_path / 'out') == contents(tmp_path / 'whole')[:summary['frames']]
     assert {path.name for path in tmp_path.iterdir()} == {'in', 'out', 'whole'}
     assert hashlib.sha256(broken.read_bytes()).digest() == before
 
@@ -266,7 +276,7 @@ def test_one_that_is_damaged_in_the_middle_is_processed_without_that(tmp_path, b
     result = run(broken, '--out', tmp_path / 'out', '--salvage', '--only-segments')
     assert result.exit_code == 1
     assert 'drive.mcap has a damaged chunk' in result.stderr
-    assert 40 <= len(messages(tmp_path / 'out')) < len(messages(CORRIDOR)) // 2
+    assert 40 <= len(contents(tmp_path / 'out')) < len(contents(CORRIDOR)) // 2
 
 
 def test_what_ros_1_had_not_finished_is_salvaged(tmp_path):
@@ -275,7 +285,7 @@ def test_what_ros_1_had_not_finished_is_salvaged(tmp_path):
     assert '--salvage' in run(path, '--out', tmp_path / 'out').stderr
     result = run(path, '--out', tmp_path / 'out', '--salvage', '--only-segments', '--quiet')
     assert result.exit_code == 1
-    assert 20 <= len(messages(tmp_path / 'out')) < 40
+    assert 20 <= len(contents(tmp_path / 'out')) < 40
 
 
 @pytest.mark.parametrize('name', ['none.bag', 'none.mcap', 'none.db3', 'none.txt'])
@@ -322,8 +332,8 @@ def test_a_run_over_what_was_salvaged_is_resumed(tmp_path, broken, monkeypatch):
     assert len(calls) == 1
     monkeypatch.undo()
     assert run(CORRIDOR, '--out', tmp_path / 'whole', '--only-segments', '--quiet').exit_code == 0
-    found = messages(out)
-    assert found == messages(tmp_path / 'whole')[:len(found)]
+    found = contents(out)
+    assert found == contents(tmp_path / 'whole')[:len(found)]
 
 
 def test_without_the_package_for_it_the_rest_works(tmp_path, broken, monkeypatch):
