@@ -9,6 +9,9 @@ HERE = Path(__file__).parent
 PACKAGE = ElementTree.parse(HERE / 'package.xml').getroot()
 NAME = PACKAGE.findtext('name')
 
+#: Recordings may be processed on a cluster; the tests start one.
+FLEET = 'distributed>=2024.1'
+
 setup(
     name=NAME,
     version=PACKAGE.findtext('version'),
@@ -39,9 +42,9 @@ setup(
         'ros': ['ros-jazzy-common-interfaces>=5.3', 'ros-jazzy-rclpy[fastrtps]>=7.1'],
         'colcon': ['colcon-output>=0.2', 'colcon-ros>=0.5', 'colcon-test-result>=0.3.8'],
         'test': [
-            'catkin_pkg>=1.0', 'hypothesis>=6.100', 'mcap-ros2-support>=0.5', 'pytest>=8', 'pytest-xdist>=3.5',
+            FLEET, 'catkin_pkg>=1.0', 'hypothesis>=6.100', 'mcap-ros2-support>=0.5', 'pytest>=8', 'pytest-xdist>=3.5',
         ],
-        'fleet': ['distributed>=2024.1'],
+        'fleet': [FLEET],
         # What ament's linters call is not required by their wheels: the plugins are those their package.xml names.
         'lint': [
             'flake8>=7', 'flake8-builtins>=2', 'flake8-comprehensions>=3.10', 'flake8-docstrings>=1.7',
