@@ -1,4 +1,4 @@
-"""Time the paper profile, step by step, beside OpenCV's Canny, LSD and, where it is installed, EdgeDrawing.
+"""Time the default, step by step, and the paper's profile, beside OpenCV's Canny, LSD and EdgeDrawing (if installed).
 
     python bench/speed.py [PHOTO ...] [--reps 15] [--results FOLDER]
 
@@ -30,7 +30,7 @@ SIZES = ((640, 480), (1280, 720), (1920, 1080))
 WIDTHS = (160, 320, 640, 960, 1280, 1920, 2560, 3840)
 #: How many rectangles the pictures of the curve by edge pixels have.
 DENSITIES = (0, 10, 30, 60, 120, 250, 500, 1000, 2000)
-PARAMETERS = Parameters.profile('paper', T1=8.0, T2=3.0, alpha=1.0)
+PAPER = 'paper profile'
 CANNY = 'OpenCV Canny(50, 150)'
 
 
@@ -72,11 +72,12 @@ def peers() -> dict[str, Contestant]:
 
 def measure(images: list[Any], reps: int) -> dict[str, float]:
     """Median over the pictures of the best milliseconds of each step, of the whole, and of the peers."""
-    extractor = LineFeatureExtractor(PARAMETERS)
-    others = peers()
+    extractor = LineFeatureExtractor()
+    others = {PAPER: LineFeatureExtractor(Parameters.paper()).extract, **peers()}
     best: dict[str, list[float]] = {name: [] for name in (*STEPS, 'all steps', *others)}
     for image in images:
-        extractor.extract(image)
+        for detect in (extractor.extract, *others.values()):
+            detect(image)
         times: dict[str, list[float]] = {name: [] for name in best}
         for _ in range(reps):
             start = time.perf_counter()
@@ -106,7 +107,7 @@ def best_of(detect: Contestant, image: Any, reps: int) -> float:
 
 def curve_by_pixels(images: list[Any], reps: int) -> dict[str, list[float]]:
     """Milliseconds of the whole and of Canny for sizes of 4:3, the median over the pictures."""
-    extractor = LineFeatureExtractor(PARAMETERS)
+    extractor = LineFeatureExtractor()
     rows: dict[str, list[float]] = {'pixels': [], 'all steps': [], CANNY: []}
     for width in WIDTHS:
         sized = [fitted(image, width, width * 3 // 4) for image in images]
@@ -118,7 +119,7 @@ def curve_by_pixels(images: list[Any], reps: int) -> dict[str, list[float]]:
 
 def curve_by_edges(reps: int) -> dict[str, list[float]]:
     """Milliseconds for pictures of 640×480 with more and more rectangles, and how many edge pixels they have."""
-    extractor = LineFeatureExtractor(PARAMETERS)
+    extractor = LineFeatureExtractor()
     rng = np.random.default_rng(0)
     image = np.full((480, 640), 128, np.uint8)
     rows: dict[str, list[float]] = {'edge pixels': [], 'all steps': []}
@@ -155,9 +156,10 @@ def print_table(result: dict[str, dict[str, float]], title: str) -> None:
     for name in next(iter(result.values())):
         cells = [f'{row[name]:.3f} ({row[name] / row[CANNY]:.2f})' for row in result.values()]
         print(f'{name:24}' + ''.join(f'{cell:>18}' for cell in cells))
-    for name in peers():
-        ratios = [f'{row["all steps"] / row[name]:.3f}' for row in result.values()]
-        print(f'{"to " + name:24}' + ''.join(f'{ratio:>18}' for ratio in ratios))
+    for ours in ('all steps', PAPER):
+        for name in peers():
+            ratios = [f'{row[ours] / row[name]:.3f}' for row in result.values()]
+            print(f'{f"{ours} to {name}":40}' + ''.join(f'{ratio:>12}' for ratio in ratios))
 
 
 def main() -> None:

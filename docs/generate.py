@@ -91,12 +91,12 @@ def yaml_value(value: Any) -> str:
 
 
 def write_pictures(folder: Path) -> None:
-    """The segments of the demo's corridor, what each step makes of it, and the panels of Fig. 5."""
+    """The segments of the demo's corridor; what each step of the paper makes of it, and the panels of its Fig. 5."""
     image, parameters = corridor().image, Parameters.paper()
     stages = LineFeatureExtractor(parameters).stages(image)
     panels = sheet(compare_pictures(image, parameters), columns=2)
     for name, picture in {
-        'corridor': draw_overlay(image, stages.segments),
+        'corridor': draw_overlay(image, LineFeatureExtractor().extract(image)),
         'stages': sheet(stage_pictures(image, stages, scale=1), columns=2),
         'section3': cv2.resize(panels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA),
     }.items():

@@ -84,8 +84,8 @@ def _process(paths: list[Path], out: Path, parameters: Parameters, *, stages: bo
 
 def _line_of(outcome: files.Outcome) -> str:
     linked = 0 if outcome.segments is None else len(outcome.segments)
-    return (f'{outcome.path}: {outcome.width}x{outcome.height}, {outcome.unlinked} segments, {linked} after linking, '
-            f'{sum(outcome.times.values()) * 1e3:.1f} ms')
+    return (f'{outcome.path}: {outcome.width}x{outcome.height}, {outcome.unlinked} segments, '
+            f'{linked} after linking or refinement, {sum(outcome.times.values()) * 1e3:.1f} ms')
 
 
 def _table_of_steps(outcomes: list[files.Outcome]) -> Table:

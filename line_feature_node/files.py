@@ -34,7 +34,7 @@ class Outcome:
         error: One sentence on what went wrong; '' when nothing did.
         width, height: Size of the picture.
         segments: SEGMENT_DTYPE.
-        unlinked: Number of segments before linking.
+        unlinked: Number of segments before linking or refinement.
         times: Seconds of each step.
         overlay, table: The files that were written.
         hint: One sentence on why there may be no segments; '' where there are.

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_feature_node.core import SEGMENT_DTYPE, end_points
+from line_feature_node.core.features import UNREFINED
 from line_feature_node.overlay import COLOURS
 
 #: Types of numbers as sensor_msgs/PointField has them.
-POINT_TYPES = {np.dtype(np.uint32): 6, np.dtype(np.float32): 7}
+POINT_TYPES = {np.dtype(np.int32): 5, np.dtype(np.uint32): 6, np.dtype(np.float32): 7}
 #: visualization_msgs/ImageMarker: pairs of points are lines; add, which replaces what was drawn before.
 LINE_LIST, ADD = 2, 0
 #: Pixels a drawn line is wide.
@@ -90,7 +91,8 @@ def little_endian(segments: NDArray[np.void]) -> NDArray[np.void]:
 def segments_of(message: Any) -> NDArray[np.void]:
     """The segments in a sensor_msgs/PointCloud2 as the node publishes them, whichever library made the message.
 
-    Fields are found by their names, so a message of another version will do: fields that it has besides are left out.
+    Fields are found by their names, so a message of another version will do: fields that it has besides are left out,
+    and those of refinement may be missing.
 
     Returns:
         SEGMENT_DTYPE; a new array.
@@ -100,22 +102,27 @@ def segments_of(message: Any) -> NDArray[np.void]:
     """
     order: Any = '>' if message.is_bigendian else '<'
     found = {field.name: field for field in message.fields}
-    offsets = []
+    names, offsets = [], []
     for name, _, kind in point_fields():
         field = found.get(name)
+        if field is None and name in UNREFINED:
+            continue
         if field is None:
             raise ValueError(f'the message has no field {name!r}: it has {", ".join(found) or "none"}')
         if field.datatype != kind or field.count != 1 or field.offset + 4 > message.point_step:
             raise ValueError(f'field {name!r} has datatype {field.datatype}, count {field.count} and offset '
                              f'{field.offset} of {message.point_step} bytes: expected datatype {kind} and count 1')
+        names.append(name)
         offsets.append(field.offset)
     size, rows = message.point_step * message.width, message.height
     if len(message.data) != message.row_step * rows or (rows and message.row_step < size):
         raise ValueError(f'{len(message.data)} bytes of data: expected {rows} rows of {message.row_step}, with '
                          f'{message.width} points of {message.point_step} bytes each')
-    formats: list[Any] = [np.dtype(SEGMENT_DTYPE[name]).newbyteorder(order) for name, *_ in point_fields()]
-    names = list(SEGMENT_DTYPE.names or ())
+    formats: list[Any] = [np.dtype(SEGMENT_DTYPE[name]).newbyteorder(order) for name in names]
     layout = np.dtype({'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': message.point_step})
     points = np.ndarray((rows, message.width), layout, np.frombuffer(message.data, np.uint8),
                         strides=(message.row_step, message.point_step))
-    return points.reshape(-1).astype(SEGMENT_DTYPE)
+    segments = np.empty(points.size, SEGMENT_DTYPE)
+    for name in SEGMENT_DTYPE.names or ():
+        segments[name] = points[name].reshape(-1) if name in names else UNREFINED[name]
+    return segments

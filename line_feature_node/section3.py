@@ -47,7 +47,8 @@ def measure_errors(parameters: Parameters, noise: float = 4.0) -> list[Errors]:
     rows = []
     for thinning in Parameters.specs()['thinning'].choices:
         for orientation in Parameters.specs()['orientation'].choices:
-            extractor = LineFeatureExtractor(replace(parameters, thinning=thinning, orientation=orientation))
+            extractor = LineFeatureExtractor(replace(
+                parameters, thinning=thinning, orientation=orientation, grouping='codes', refine=False))
             figures = []
             for scene in scenes:
                 agreement = compare(end_points(extractor.extract(scene.image)), scene.truth, scene.weak)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_feature_node.core import SEGMENT_DTYPE
-from line_feature_node.core.features import VERTICAL
+from line_feature_node.core.features import UNREFINED, VERTICAL
 
 #: A segment matches a true one when both its ends are this near to the true line (pixels), ...
 DISTANCE = 2.0
@@ -103,6 +103,8 @@ def segments_of_truth(truth: NDArray[np.floating], weak: NDArray[np.floating]) -
     """
     ends = np.concatenate([truth, weak])
     segments = np.zeros(len(ends), SEGMENT_DTYPE)
+    for name, value in UNREFINED.items():
+        segments[name] = value
     for name, column in zip(('x1', 'y1', 'x2', 'y2'), ends.T, strict=True):
         segments[name] = column
     segments['x'], segments['y'] = (ends[:, 0] + ends[:, 2]) / 2, (ends[:, 1] + ends[:, 3]) / 2

@@ -32,7 +32,7 @@ def photo(tmp_path):
 def test_an_image_gives_an_overlay_and_a_table(run, photo, tmp_path):
     result = run('image', photo, '--out', tmp_path / 'out')
     assert result.exit_code == 0, result.output
-    assert '120x90, 1 segments, 1 after linking' in result.output
+    assert '120x90, 1 segments, 1 after linking or refinement' in result.output
     assert 'normalization' in result.output
     overlay = cv2.imread(str(tmp_path / 'out' / 'photo-overlay.png'))
     assert overlay.shape == (90, 120, 3)
@@ -88,7 +88,7 @@ def test_every_parameter_is_an_option_and_reaches_the_extractor(run, photo, tmp_
     for name in Parameters.specs():
         assert f'--{name} ' in output
     result = run('image', photo, '--out', tmp_path / 'out', '--T1', 900, '--profile', 'paper')
-    assert '0 segments, 0 after linking' in result.output
+    assert '0 segments, 0 after linking or refinement' in result.output
 
 
 @pytest.mark.parametrize(('arguments', 'sentence'), [

@@ -16,6 +16,7 @@ from line_feature_node.core.edges import (
     deriche_stencil,
     extract_edges,
     gradient,
+    kept_gradient,
     recur,
 )
 from line_feature_node.core.parameters import Parameters
@@ -48,9 +49,12 @@ class Shelf(Buffers):
 
 
 def marks_of(image: npt.NDArray[Any], buffers: Buffers | None = None, **parameters: Any) -> npt.NDArray[np.uint8]:
-    """The marks of an image without their margin."""
+    """The marks of an image without their margin, the same ones whether the gradient is kept or not."""
     height, width = image.shape
-    marks = extract_edges(np.ascontiguousarray(image), Parameters(**parameters), buffers or Buffers())
+    kept = extract_edges(
+        np.ascontiguousarray(image), Parameters.profile('paper', **parameters, refine=True), Buffers())
+    marks = extract_edges(np.ascontiguousarray(image), Parameters.profile('paper', **parameters), buffers or Buffers())
+    np.testing.assert_array_equal(kept, marks)
     outside = marks.copy()
     outside[MARGIN:MARGIN + height, MARGIN:MARGIN + width] = 0
     assert not outside.any()
@@ -129,6 +133,16 @@ def excess(gx: Floats, gy: Floats) -> tuple[Floats, Floats]:
                               + v * ((1 - u) * norm[top + 1, left] + u * norm[top + 1, left + 1]))
             parts[row, column] = (norm[row, column] - max(beside)) / max(norm[row, column], 1e-300)
     return norm[1:-1, 1:-1], parts[1:-1, 1:-1]
+
+
+def kept_of(
+    image: npt.NDArray[Any], buffers: Buffers, **parameters: Any,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """gx and gy as later steps see them, with the pixel of padding that they may look at."""
+    extract_edges(np.ascontiguousarray(image), Parameters.profile('paper', **parameters, refine=True), buffers)
+    around = slice(PAD - 1, PAD + image.shape[0] + 1), slice(PAD - 1, PAD + image.shape[1] + 1)
+    gx, gy = kept_gradient(buffers)
+    return gx[around].copy(), gy[around].copy()
 
 
 def noise(height: int, width: int, seed: int = 0) -> npt.NDArray[np.float32]:
@@ -378,3 +392,13 @@ def test_buffers_keep_nothing_of_the_frame_before() -> None:
         for operator in USUAL:
             image = noise(height, width, seed)
             np.testing.assert_array_equal(marks_of(image, buffers, **operator), marks_of(image, **operator))
+
+
+@pytest.mark.parametrize('operator', USUAL, ids=named)
+def test_gradient_that_is_kept_is_that_of_the_definition(operator: dict[str, Any]) -> None:
+    """Also beside the picture, and whatever picture was there before."""
+    buffers = Buffers()
+    for seed, (height, width) in enumerate([(40, 50), (33, 50), (40, 51), (1, 1), (3, 17), (40, 50)]):
+        image = noise(height, width, seed)
+        for found, expected in zip(kept_of(image, buffers, **operator), reference(image, **operator), strict=True):
+            np.testing.assert_allclose(found, expected, atol=2e-3)

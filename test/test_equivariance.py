@@ -13,6 +13,7 @@ from line_feature_node.scenes import Camera, corridor
 
 DATA = Path(__file__).resolve().parents[2] / 'shared' / 'data'
 PHOTOS = [*sorted((DATA / 'york' / 'images').glob('*.jpg'))[:6], *sorted((DATA / 'scenes' / 'corridor').glob('*.jpg'))]
+BOTH = pytest.mark.parametrize('profile', ['default', 'paper'])
 #: The moved image, and where a point (x, y) comes to lie when the last column is `right` and the last row `bottom`.
 MOVES: dict[str, tuple[Callable[[Any], Any], Callable[..., Any]]] = {
     'mirrored': (np.fliplr, lambda x, y, right, _: (right - x, y)),
@@ -42,9 +43,9 @@ def covered(segments: Any, others: Any) -> float:
     return total
 
 
-def check(images: list[Any], move: str) -> None:
+def check(images: list[Any], move: str, profile: str) -> None:
     turned, moved = MOVES[move]
-    extractor = LineFeatureExtractor(Parameters.paper())
+    extractor = LineFeatureExtractor(Parameters.profile(profile))
     pixels = changed = length = shared = 0.0
     for image in images:
         bottom, right = np.array(image.shape) - 1
@@ -57,29 +58,33 @@ def check(images: list[Any], move: str) -> None:
         for first, second in ((expected, end_points(after.segments)), (end_points(after.segments), expected)):
             length += np.hypot(first[:, 2] - first[:, 0], first[:, 3] - first[:, 1]).sum()
             shared += covered(first, second)
-    assert changed <= pixels / 10000
+    # The noise is measured in some rows, so a picture on its side has another alpha and other thresholds, by a little.
+    assert changed <= pixels / (1000 if extractor.parameters.adaptive else 10000)
     assert shared >= 0.95 * length
 
 
+@BOTH
 @pytest.mark.parametrize('move', MOVES)
-def test_rendered_corridors(move: str) -> None:
+def test_rendered_corridors(profile: str, move: str) -> None:
     check([cv2.cvtColor(corridor(Camera(x=2.0 + 4 * k), seed=k, layout=k).image, cv2.COLOR_BGR2GRAY)
-           for k in range(3)], move)
+           for k in range(3)], move, profile)
 
 
 @pytest.mark.skipif(not PHOTOS, reason='the photographs are not part of the project')
+@BOTH
 @pytest.mark.parametrize('move', MOVES)
-def test_photographs(move: str) -> None:
-    check([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in PHOTOS], move)
+def test_photographs(profile: str, move: str) -> None:
+    check([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in PHOTOS], move, profile)
 
 
+@BOTH
 @pytest.mark.parametrize('shape', [(1, 1), (4320, 1), (1, 7680), (3, 7680), (4320, 7680)])
-def test_extreme_sizes(shape: tuple[int, int]) -> None:
+def test_extreme_sizes(profile: str, shape: tuple[int, int]) -> None:
     """One-pixel-wide images and 8K ones: a cross is found wherever there is room for one."""
     image = np.full(shape, 60, np.uint8)
     middle = shape[0] // 2, shape[1] // 2
     image[middle[0]:, middle[1]:] = 200
-    segments = LineFeatureExtractor(Parameters.paper()).extract(image)
+    segments = LineFeatureExtractor(Parameters.profile(profile)).extract(image)
     if min(shape) > 100:
         assert len(segments) == 2
         assert sorted(segments['length']) == pytest.approx([shape[0] / 2, shape[1] / 2], abs=12)

@@ -337,7 +337,7 @@ def test_bridged_pixels_do_not_bend_the_line() -> None:
 @pytest.mark.parametrize('margin', [1, 2, 5])
 def test_margin_is_no_part_of_the_image(margin: int) -> None:
     blob = line((2, 1))
-    assert segment(blob, margin=margin) == segment(blob)
+    assert segment(blob, margin=margin).tobytes() == segment(blob).tobytes()
 
 
 @pytest.mark.parametrize('code', [1, 2, 3, 4])
@@ -346,11 +346,19 @@ def test_code(code: int) -> None:
     assert found['code'].tolist() == [code, 5 - code]
 
 
+def test_what_refinement_finds_out_is_unknown() -> None:
+    found = segments([line((1, 0)), line((0, 1)), line((3, 2))])
+    for name in ('sigma_theta', 'sigma_offset', 'contrast', 'log_nfa'):
+        assert np.isnan(found[name]).all(), name
+    assert (found['polarity'] == 0).all()
+
+
 def test_layout() -> None:
     """Every field has four bytes, as in the message."""
     assert SEGMENT_DTYPE.names[:13] == (
         'x', 'y', 'z', 'x1', 'y1', 'x2', 'y2', 'length', 'theta', 'intercept', 'rho', 'code', 'size')
     for name in SEGMENT_DTYPE.names:
-        assert SEGMENT_DTYPE[name] == (np.uint32 if name in ('code', 'size') else np.float32)
+        kind = {'code': np.uint32, 'size': np.uint32, 'polarity': np.int32}.get(name, np.float32)
+        assert SEGMENT_DTYPE[name] == kind
     assert SEGMENT_DTYPE.itemsize == 4 * len(SEGMENT_DTYPE.names)
     assert segments([line((1, 0))]).dtype == SEGMENT_DTYPE

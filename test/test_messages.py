@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from line_feature_node.core import SEGMENT_DTYPE, extract
+from line_feature_node.core.features import UNREFINED
 from line_feature_node.messages import Messages, little_endian, point_fields, segments_of
 from line_feature_node.overlay import COLOURS
 
@@ -73,7 +74,7 @@ def cloud(segments, order='<', extra=(), names=SEGMENT_DTYPE.names, padding=0, r
         points[name] = 77
     width = len(segments) // rows
     data = b''.join(row.tobytes() + b'\xee' * padding for row in points.reshape(rows, width))
-    kinds = {'f4': 7, 'u4': 6, 'f8': 8, 'u2': 4, 'u1': 2}
+    kinds = {'f4': 7, 'u4': 6, 'i4': 5, 'f8': 8, 'u2': 4, 'u1': 2}
     return SimpleNamespace(
         height=rows, width=width, is_bigendian=order == '>', point_step=layout.itemsize,
         row_step=layout.itemsize * width + padding, data=data, is_dense=True,
@@ -89,7 +90,7 @@ def test_fields_of_the_message_are_those_of_the_records(messages, header):
     for field in message.fields:
         kind, offset = SEGMENT_DTYPE.fields[field.name]
         assert (field.offset, field.count) == (offset, 1)
-        assert field.datatype == {np.dtype('f4'): 7, np.dtype('u4'): 6}[kind]
+        assert field.datatype == {np.dtype('f4'): 7, np.dtype('u4'): 6, np.dtype('i4'): 5}[kind]
 
 
 def test_every_field_has_four_bytes_and_none_is_between_them():
@@ -200,7 +201,15 @@ def test_message_without_points_gives_no_segments(height, width):
     assert segments_of(message).shape == (0,)
 
 
-@pytest.mark.parametrize('name', SEGMENT_DTYPE.names)
+@pytest.mark.parametrize('missing', [['sigma_theta'], ['polarity', 'log_nfa'], list(UNREFINED)])
+def test_fields_of_refinement_may_be_missing(missing):
+    segments = some_segments()
+    found = segments_of(cloud(segments, names=[name for name in SEGMENT_DTYPE.names if name not in missing]))
+    for name in SEGMENT_DTYPE.names:
+        np.testing.assert_array_equal(found[name], UNREFINED[name] if name in missing else segments[name], err_msg=name)
+
+
+@pytest.mark.parametrize('name', [name for name in SEGMENT_DTYPE.names if name not in UNREFINED])
 def test_missing_field_is_named(name):
     message = cloud(some_segments(), names=[other for other in SEGMENT_DTYPE.names if other != name])
     with pytest.raises(ValueError, match=f"the message has no field '{name}': it has "):
@@ -215,12 +224,12 @@ def test_message_without_any_field_says_so():
 
 
 @pytest.mark.parametrize(('name', 'wrong', 'reason'), [
-    ('x', {'datatype': 8}, "field 'x' has datatype 8, count 1 and offset 0 of 52 bytes: expected datatype 7 and"),
+    ('x', {'datatype': 8}, "field 'x' has datatype 8, count 1 and offset 0 of 72 bytes: expected datatype 7 and"),
     ('code', {'datatype': 5}, "field 'code' has datatype 5, .* expected datatype 6 and count 1"),
     ('theta', {'count': 2}, "field 'theta' has datatype 7, count 2"),
     ('theta', {'count': 0}, "field 'theta' has datatype 7, count 0"),
-    ('size', {'offset': 49}, "field 'size' has .* offset 49 of 52 bytes"),
-    ('y', {'offset': 2**32 - 1}, "field 'y' has .* offset 4294967295 of 52 bytes"),
+    ('size', {'offset': 69}, "field 'size' has .* offset 69 of 72 bytes"),
+    ('y', {'offset': 2**32 - 1}, "field 'y' has .* offset 4294967295 of 72 bytes"),
 ])
 def test_field_of_another_kind_is_named(name, wrong, reason):
     message = cloud(some_segments())
@@ -231,15 +240,15 @@ def test_field_of_another_kind_is_named(name, wrong, reason):
 
 
 @pytest.mark.parametrize(('wrong', 'reason'), [
-    ({'width': 51}, '2600 bytes of data: expected 1 rows of 2600, with 51 points of 52 bytes each'),
-    ({'width': 2**32 - 1}, '2600 bytes of data: expected 1 rows of 2600, with 4294967295 points'),
-    ({'height': 2}, '2600 bytes of data: expected 2 rows of 2600'),
-    ({'height': 0}, '2600 bytes of data: expected 0 rows of 2600'),
-    ({'height': 2**32 - 1}, '2600 bytes of data: expected 4294967295 rows'),
-    ({'row_step': 0}, '2600 bytes of data: expected 1 rows of 0'),
-    ({'point_step': 53}, '2600 bytes of data: expected 1 rows of 2600, with 50 points of 53 bytes each'),
-    ({'data': bytes(2599)}, '2599 bytes of data: expected 1 rows of 2600'),
-    ({'data': bytes(2652)}, '2652 bytes of data'),
+    ({'width': 51}, '3600 bytes of data: expected 1 rows of 3600, with 51 points of 72 bytes each'),
+    ({'width': 2**32 - 1}, '3600 bytes of data: expected 1 rows of 3600, with 4294967295 points'),
+    ({'height': 2}, '3600 bytes of data: expected 2 rows of 3600'),
+    ({'height': 0}, '3600 bytes of data: expected 0 rows of 3600'),
+    ({'height': 2**32 - 1}, '3600 bytes of data: expected 4294967295 rows'),
+    ({'row_step': 0}, '3600 bytes of data: expected 1 rows of 0'),
+    ({'point_step': 73}, '3600 bytes of data: expected 1 rows of 3600, with 50 points of 73 bytes each'),
+    ({'data': bytes(3599)}, '3599 bytes of data: expected 1 rows of 3600'),
+    ({'data': bytes(3672)}, '3672 bytes of data'),
     ({'data': b''}, '0 bytes of data'),
     ({'point_step': 0}, 'offset 0 of 0 bytes'),
 ])
@@ -250,12 +259,12 @@ def test_sizes_that_disagree_are_named(wrong, reason):
         segments_of(message)
 
 
-NUMBERS = st.one_of(st.integers(0, 60), st.sampled_from([52, 104, 2**31 - 1, 2**31, 2**32 - 1]))
+NUMBERS = st.one_of(st.integers(0, 80), st.sampled_from([72, 144, 2**31 - 1, 2**31, 2**32 - 1]))
 
 
 @given(changes=st.dictionaries(st.sampled_from(['height', 'width', 'point_step', 'row_step']), NUMBERS),
        field=st.sampled_from(SEGMENT_DTYPE.names), wrong=st.dictionaries(
-           st.sampled_from(['offset', 'count', 'datatype']), NUMBERS), length=st.integers(0, 104))
+           st.sampled_from(['offset', 'count', 'datatype']), NUMBERS), length=st.integers(0, 144))
 @settings(max_examples=500, deadline=None)
 def test_whatever_the_fields_are_only_a_value_error_is_raised(changes, field, wrong, length):
     message = cloud(some_segments(2))

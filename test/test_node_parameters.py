@@ -22,9 +22,10 @@ TYPES = {
 }
 #: A value of each parameter that is neither its default nor refused.
 OTHERS = {
-    'operator': 'sobel', 'alpha': 2.5, 'sigma': 2.0, 'T1': 9.5, 'T2': 2.5, 'intensity_min': -5.0, 'intensity_max': 9.0,
-    'thinning': 'none', 'max_gap': 1, 'min_chain': 9, 'n': 7, 'min_size': 6, 'orientation': 'least_squares',
-    'tau1': 1.5, 'tau2': 7.5, 'min_length': 3.5, 'max_segments': 11, 'theta_min': -0.5, 'theta_max': 0.5,
+    'operator': 'sobel', 'alpha': 2.5, 'sigma': 2.0, 'T1': 9.5, 'T2': 2.5, 'noise_T1': 3.0, 'noise_T2': 1.5,
+    'intensity_min': -5.0, 'intensity_max': 9.0, 'thinning': 'none', 'max_gap': 1, 'min_chain': 9, 'n': 7,
+    'grouping': 'codes', 'min_size': 6, 'orientation': 'least_squares', 'tau1': 1.5, 'tau2': 7.5, 'refine': False,
+    'min_snr': 9.0, 'false_alarms': 0.5, 'min_length': 3.5, 'max_segments': 11, 'theta_min': -0.5, 'theta_max': 0.5,
     'roi': [0.0, 0.5, 1.0, 0.5], 'scale': 0.5, 'profile': 'paper', 'lazy': False, 'jpeg_quality': 55,
     'image_timeout': 3.5, 'max_latency': 0.5, 'max_dropped': 0.5,
 }
@@ -133,7 +134,7 @@ def test_numbers_of_the_other_kind_are_taken_from_the_command_line(bench, argume
     ({'T1': 'high'}, "T1 must be a number of 0 to 1000 grey levels/pixel, got 'high'"),
     ({'T1': True}, 'T1 must be a number of 0 to 1000 grey levels/pixel, got True'),
     ({'T1': float('nan')}, 'T1 must be 0 to 1000 grey levels/pixel, got nan'),
-    ({'T1': 2.0}, 'T2 must be less than T1, got T2 = 3 and T1 = 2'),
+    ({'T1': 2.0}, 'T2 must be less than T1, got T2 = 2 and T1 = 2'),
     ({'n': 4.5}, 'n must be a whole number of 0 to 10000 pixels, got 4.5'),
     ({'n': -1}, 'n must be 0 to 10000 pixels, got -1'),
     ({'operator': 'canny'}, "operator must be one of deriche, .*, got 'canny'"),
@@ -250,7 +251,7 @@ def test_thresholds_can_be_set_together(bench):
     """T1 alone would be less than T2."""
     node = bench.node()
     client = bench.parameters()
-    assert bench.set(client, T1=2.0) == 'T2 must be less than T1, got T2 = 3 and T1 = 2'
+    assert bench.set(client, T1=2.0) == 'T2 must be less than T1, got T2 = 2 and T1 = 2'
     assert bench.set(client, T1=2.0, T2=1.0) == ''
     assert (node._settings.parameters.T1, node._settings.parameters.T2) == (2.0, 1.0)
     assert values(bench, client, 'T1', 'T2') == [2.0, 1.0]
@@ -259,10 +260,10 @@ def test_thresholds_can_be_set_together(bench):
 def test_bad_combination_is_refused_with_a_reason_and_nothing_is_changed(bench):
     node = bench.node()
     client, before = bench.parameters(), (node._settings.parameters, node._settings.options)
-    reason = bench.set(client, alpha=2.0, lazy=False, T1=1.0, T2=5.0)
+    reason = bench.set(client, n=7, lazy=False, T1=1.0, T2=5.0)
     assert reason == 'T2 must be less than T1, got T2 = 5 and T1 = 1'
     assert (node._settings.parameters, node._settings.options) == before
-    assert values(bench, client, 'alpha', 'lazy', 'T1', 'T2') == [1.0, True, 8.0, 3.0]
+    assert values(bench, client, 'n', 'lazy', 'T1', 'T2') == [4, True, 4.0, 2.0]
 
 
 def test_each_parameter_that_is_set_by_itself_has_its_own_result(bench):
@@ -272,7 +273,7 @@ def test_each_parameter_that_is_set_by_itself_has_its_own_result(bench):
     changes = [Parameter('T2', value=9.0), Parameter('T1', value=20.0), Parameter('T2', value=9.0)]
     results = bench.wait(client.set_parameters(changes)).results
     assert [result.successful for result in results] == [False, True, True]
-    assert results[0].reason == 'T2 must be less than T1, got T2 = 9 and T1 = 8'
+    assert results[0].reason == 'T2 must be less than T1, got T2 = 9 and T1 = 4'
     assert (node._settings.parameters.T1, node._settings.parameters.T2) == (20.0, 9.0)
 
 
@@ -348,14 +349,14 @@ def test_intensity_beyond_all_measure_is_refused(bench):
 
 
 def test_profile_while_running_sets_all_that_it_does_and_resets_the_others(bench, profile):
-    node = bench.node(T1=50.0, alpha=2.0)
+    node = bench.node(T1=50.0, tau1=2.0)
     client = bench.parameters()
     assert bench.set(client, profile=profile) == ''
     assert node._settings.parameters == Parameters.profile(profile) == Parameters(T1=20.0, T2=10.0, n=9)
-    assert values(bench, client, 'profile', 'T1', 'T2', 'n', 'alpha') == ['odd', 20.0, 10.0, 9, 1.0]
+    assert values(bench, client, 'profile', 'T1', 'T2', 'n', 'tau1') == ['odd', 20.0, 10.0, 9, 1.0]
     assert bench.set(client, profile='default') == ''
     assert node._settings.parameters == Parameters()
-    assert values(bench, client, 'profile', 'T1', 'T2', 'n') == ['default', 8.0, 3.0, 4]
+    assert values(bench, client, 'profile', 'T1', 'T2', 'n') == ['default', 4.0, 2.0, 4]
 
 
 def test_values_set_together_with_a_profile_win(bench, profile):
@@ -371,7 +372,7 @@ def test_profile_that_contradicts_what_is_set_with_it_is_refused_whole(bench, pr
     client = bench.parameters()
     assert bench.set(client, profile=profile, T1=5.0) == 'T2 must be less than T1, got T2 = 10 and T1 = 5'
     assert node._settings.parameters == Parameters()
-    assert values(bench, client, 'profile', 'T1', 'T2', 'n') == ['default', 8.0, 3.0, 4]
+    assert values(bench, client, 'profile', 'T1', 'T2', 'n') == ['default', 4.0, 2.0, 4]
 
 
 def test_parameters_of_the_extractor_are_swapped_as_one(bench):
@@ -393,4 +394,4 @@ def test_option_leaves_the_extractor_as_it_is(bench):
 def test_parameters_of_two_nodes_are_their_own(bench):
     left, right = bench.node('-r', '__ns:=/left'), bench.node('-r', '__ns:=/right')
     assert bench.set(bench.parameters(f'/left{NAME}'), T1=20.0) == ''
-    assert (left._settings.parameters.T1, right._settings.parameters.T1) == (20.0, 8.0)
+    assert (left._settings.parameters.T1, right._settings.parameters.T1) == (20.0, 4.0)

@@ -177,7 +177,7 @@ def test_parameters_file_with_whole_numbers_and_a_misspelt_name(bench, start, tm
 
 @pytest.mark.parametrize(('arguments', 'reason'), [
     (['--ros-args', '-p', 'T1:=5000'], 'T1 must be 0 to 1000 grey levels/pixel, got 5000'),
-    (['--ros-args', '-p', 'T1:=1'], 'T2 must be less than T1, got T2 = 3 and T1 = 1'),
+    (['--ros-args', '-p', 'T1:=1'], 'T2 must be less than T1, got T2 = 2 and T1 = 1'),
     (['--ros-args', '-p', 'mask_file:=/none.png'], 'mask_file /none.png: No such file or directory'),
     (['--params-file', 'x.yaml'], "unknown argument '--params-file': parameters stand behind --ros-args"),
     (['--ros-args', '--nonsense'], 'unknown arguments behind --ros-args'),

@@ -42,7 +42,7 @@ def reference(codes: list[int], n: int, closed: bool = False) -> list[int]:
 def normalized(codes: list[int], n: int, closed: bool = False) -> list[int]:
     array = np.array(codes, np.uint8)
     size = array.size
-    chains = Chains(np.arange(size, dtype=np.int32), array, np.zeros(size, np.uint8), np.zeros(size, np.bool_),
+    chains = Chains(np.arange(size, dtype=np.int32), array, np.zeros(size, np.bool_),
                     np.array([0, size], np.int32), np.array([closed]))
     normalize_codes(chains, n)
     return array.tolist()
@@ -181,7 +181,7 @@ def test_chains_are_normalized_each_by_itself() -> None:
     codes = np.array([code for part, _ in parts for code in part], np.uint8)
     offsets = np.cumsum([0] + [len(part) for part, _ in parts]).astype(np.int32)
     size = codes.size
-    chains = Chains(np.zeros(size, np.int32), codes, np.zeros(size, np.uint8), np.zeros(size, np.bool_), offsets,
+    chains = Chains(np.zeros(size, np.int32), codes, np.zeros(size, np.bool_), offsets,
                     np.array([closed for _, closed in parts]))
     normalize_codes(chains, 4)
     assert codes.tolist() == [code for part, closed in parts for code in reference(part, 4, closed)]
@@ -189,7 +189,7 @@ def test_chains_are_normalized_each_by_itself() -> None:
 
 def test_no_chains() -> None:
     empty = np.empty(0, np.uint8)
-    normalize_codes(Chains(np.empty(0, np.int32), empty, empty, np.empty(0, np.bool_), np.zeros(1, np.int32),
+    normalize_codes(Chains(np.empty(0, np.int32), empty, np.empty(0, np.bool_), np.zeros(1, np.int32),
                            np.empty(0, np.bool_)), 4)
 
 

@@ -13,7 +13,8 @@ from line_feature_node.core.parameters import PROFILES, Parameters, ParameterSet
 
 SPECS = Parameters.specs()
 DEFAULTS = dataclasses.asdict(Parameters())
-NUMBERS = [name for name in SPECS if isinstance(DEFAULTS[name], int | float)]
+SWITCHES = [name for name in SPECS if isinstance(DEFAULTS[name], bool)]
+NUMBERS = [name for name in SPECS if isinstance(DEFAULTS[name], int | float) and name not in SWITCHES]
 WHOLE = [name for name in NUMBERS if isinstance(DEFAULTS[name], int)]
 REAL = [name for name in NUMBERS if isinstance(DEFAULTS[name], float)]
 CHOICES = [name for name, spec in SPECS.items() if spec.choices]
@@ -35,7 +36,7 @@ class Mixed(ParameterSet):
 
 
 def test_every_parameter_is_of_one_kind() -> None:
-    assert sorted([*WHOLE, *REAL, *CHOICES, *LISTS]) == sorted(SPECS)
+    assert sorted([*SWITCHES, *WHOLE, *REAL, *CHOICES, *LISTS]) == sorted(SPECS)
     assert sorted([*WHOLE, *REAL]) == sorted(NUMBERS)
     assert 'roi' in LISTS
 
@@ -58,7 +59,8 @@ def test_defaults_are_valid() -> None:
 def test_every_parameter_is_described() -> None:
     for name, spec in SPECS.items():
         assert spec.description.endswith('.'), name
-        assert spec.choices or (math.isfinite(spec.low) and math.isfinite(spec.high)), name
+        bounded = math.isfinite(spec.low) and math.isfinite(spec.high)
+        assert spec.choices or bounded or name in SWITCHES, name
 
 
 @pytest.mark.parametrize(('name', 'end'), [
@@ -101,8 +103,8 @@ def test_nan_only_where_it_means_unset(name: str) -> None:
             Parameters(**{name: math.nan})
 
 
-def test_unset_are_the_intensities() -> None:
-    assert set(UNSET) == {'intensity_min', 'intensity_max'}
+def test_unset_are_the_intensities_and_alpha() -> None:
+    assert set(UNSET) == {'alpha', 'intensity_min', 'intensity_max'}
 
 
 @pytest.mark.parametrize('name', NUMBERS)
@@ -125,7 +127,7 @@ def test_float_for_a_whole_number_is_refused(name: str, value: float) -> None:
 @pytest.mark.parametrize('kind', [int, float, np.float32, np.float64, np.int32, np.uint8])
 def test_numbers_of_any_type(name: str, kind: type) -> None:
     """Whole numbers and numpy's scalars will do for a number, which is kept as a float."""
-    value = {'alpha': 2, 'sigma': 2, 'T2': 4, 'intensity_max': 100, 'tau1': 9, 'theta_min': 1, 'theta_max': 1,
+    value = {'alpha': 2, 'sigma': 2, 'T2': 3, 'intensity_max': 100, 'tau1': 9, 'theta_min': 1, 'theta_max': 1,
              'scale': 1}.get(name, 50)
     given = kind(value)
     kept = getattr(Parameters(**{name: given}), name)
@@ -147,6 +149,18 @@ def test_whole_numbers_of_any_type(name: str, kind: type) -> None:
     kept = getattr(Parameters(**{name: kind(6)}), name)
     assert kept == 6
     assert type(kept) is int
+
+
+@pytest.mark.parametrize('name', SWITCHES)
+def test_switches(name: str) -> None:
+    for value in (True, False, np.True_, np.False_):
+        kept = getattr(Parameters(**{name: value}), name)
+        assert kept == value
+        assert type(kept) is bool
+    for wrong in (0, 1, 1.0, 'true', None, np.uint8(1), [True]):
+        with pytest.raises(TypeError, match=rf'^{name} must be true or false, got') as caught:
+            Parameters(**{name: wrong})
+        assert repr(wrong) in str(caught.value)
 
 
 @pytest.mark.parametrize('name', CHOICES)
@@ -434,7 +448,8 @@ def test_copies_are_equal() -> None:
 
 
 def test_range_in_words() -> None:
-    assert SPECS['alpha'].range == f'{SPECS["alpha"].low:g} to {SPECS["alpha"].high:g}'
+    assert SPECS['sigma'].range == f'{SPECS["sigma"].low:g} to {SPECS["sigma"].high:g}'
+    assert SPECS['refine'].range == ''
     assert SPECS['operator'].range == ', '.join(SPECS['operator'].choices)
     assert SPECS['intensity_min'].range.endswith(', or nan for unset')
     assert Spec('Anything.').range == ''
@@ -491,3 +506,17 @@ def test_tables_are_equal_where_all_values_are() -> None:
     assert Parameters() != Mixed()
     with pytest.raises(dataclasses.FrozenInstanceError):
         Mixed().flag = True
+
+
+# What the steps are to do.
+
+def test_paper_does_not_depend_on_noise() -> None:
+    assert not Parameters.paper().adaptive
+    assert Parameters().adaptive
+
+
+@pytest.mark.parametrize(('given', 'expected'), [
+    ({'alpha': math.nan}, True), ({'noise_T1': 0.1}, True), ({'noise_T2': 0.1}, True), ({'alpha': 2.0}, False),
+    ({'refine': True, 'grouping': 'straightness'}, False)], ids=str)
+def test_adaptive_is_what_depends_on_the_noise(given: dict[str, Any], expected: bool) -> None:
+    assert Parameters.profile('paper', **given).adaptive is expected

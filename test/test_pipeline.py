@@ -15,8 +15,11 @@ from line_feature_node.core import SEGMENT_DTYPE, STEPS, LineFeatureExtractor, P
 
 Image = npt.NDArray[Any]
 TYPES = [np.uint8, np.uint16, np.float32]
+BOTH = pytest.mark.parametrize('profile', ['default', 'paper'])
 #: Column and row steps of the chain code: 0 is +x, then in steps of 45 degrees towards +y.
 STEPS_OF_CODE = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
+#: Known of refined segments only.
+OF_REFINED = ('sigma_theta', 'sigma_offset', 'contrast', 'polarity', 'log_nfa')
 FRAMES = ['grey', 'candidates', 'strong', 'edges', 'chain_pixels', 'chain_offsets', 'chain_directions', 'closed',
           'bridged', 'codes_before', 'codes_after', 'blobs', 'blob_pixels', 'blob_offsets', 'unlinked', 'linked',
           'segments']
@@ -69,19 +72,20 @@ def same(first: npt.NDArray[np.void], second: npt.NDArray[np.void]) -> bool:
 ANGLES = [0, 1, 5, 10, 17, 22.5, 24, 31, 38, 45, 46, 52, 60, 67.5, 71, 80, 88, 90, 93, 112.5, 120, 135, 143, 157.5, 174]
 
 
+@BOTH
 @pytest.mark.parametrize('dark', [False, True], ids=['bright', 'dark'])
 @pytest.mark.parametrize('degrees', ANGLES)
-def test_straight_edge(degrees: float, dark: bool) -> None:
+def test_straight_edge(profile: str, degrees: float, dark: bool) -> None:
     """It is one segment, with its position, its angle and nine tenths of its length.
 
-    Where the code changes, at 22.5 degrees and so on, the border of the image may turn the gradient enough to cut off
-    a few pixels at an end. And the end points of (A.5) and (A.6) come from the minimum rectangle: of a line at one
-    degree, which is three pixels high, they cut off up to a pixel's worth of rise.
+    By codes: where the code changes, at 22.5 degrees and so on, the border of the image may turn the gradient enough
+    to cut off a few pixels at an end. And the end points of (A.5) and (A.6) come from the minimum rectangle: of a line
+    at one degree, which is three pixels high, they cut off up to a pixel's worth of rise.
     """
     size, centre = 151, 75
     side = half_plane(size, size, degrees, centre, centre)
     image = np.round(60 + 120 * (1 - side if dark else side)).astype(np.uint8)
-    found = extract(image)
+    found = extract(image, profile=profile)
     segment = found[found['length'].argmax()]
     assert found['length'].sum() - segment['length'] <= (15 if degrees % 45 == 22.5 else 0)
     radians = math.radians(degrees)
@@ -99,28 +103,30 @@ def test_straight_edge(degrees: float, dark: bool) -> None:
         assert segment['code'] == math.floor(gradient) % 4 + 1
 
 
+@BOTH
 @pytest.mark.parametrize('degrees', ANGLES)
 @pytest.mark.parametrize('shift', [0.3, 0.7])
-def test_straight_edge_between_pixels(degrees: float, shift: float) -> None:
+def test_straight_edge_between_pixels(profile: str, degrees: float, shift: float) -> None:
     """Wherever it lies, it is one segment and no point of it is more than a pixel off."""
     radians = math.radians(degrees)
     cos, sin = math.cos(radians), math.sin(radians)
     x, y = 75 - shift * sin, 75 + shift * cos
-    found = extract((60 + 120 * half_plane(151, 151, degrees, x, y)).astype(np.float32))
+    found = extract((60 + 120 * half_plane(151, 151, degrees, x, y)).astype(np.float32), profile=profile)
     assert len(found) == 1 or degrees % 45 == 22.5
     for segment in found:
         for end_x, end_y in (('x', 'y'), ('x1', 'y1'), ('x2', 'y2')):
             assert abs((segment[end_y] - y) * cos - (segment[end_x] - x) * sin) < 1
 
 
+@BOTH
 @pytest.mark.parametrize('operator', Parameters.specs()['operator'].choices)
 @pytest.mark.parametrize('degrees', [*ANGLES, *(math.degrees(math.atan2(*slope)) for slope in (
     (1, 2), (2, 1), (1, 3), (3, 1), (2, 3), (3, 2), (1, -2), (2, -1), (1, -3), (3, -1), (2, -3)))])
-def test_straight_edge_is_thin_and_has_no_gap(degrees: float, operator: str) -> None:
+def test_straight_edge_is_thin_and_has_no_gap(profile: str, degrees: float, operator: str) -> None:
     """Ties of norms neither tear it nor leave it thick, wherever it lies: from border to border it hangs together."""
     radians = math.radians(degrees)
     steep = abs(math.sin(radians)) > abs(math.cos(radians))
-    extractor = LineFeatureExtractor(Parameters(operator=operator, max_gap=0, min_chain=1, T1=4, T2=2))
+    extractor = LineFeatureExtractor(Parameters.profile(profile, operator=operator, max_gap=0, min_chain=1, T1=4, T2=2))
     for shift in (0, 0.25, 0.5, 0.8):
         side = half_plane(61, 61, degrees, 30 + shift * steep, 30 + shift * (not steep))
         for image in (np.round(60 + 120 * side).astype(np.uint8), (180 - 120 * side).astype(np.float32)):
@@ -131,22 +137,24 @@ def test_straight_edge_is_thin_and_has_no_gap(degrees: float, operator: str) -> 
             assert across.mean() > 0.5
 
 
+@BOTH
 @pytest.mark.parametrize('operator', ['deriche', 'sobel'])
-def test_turned_image_has_turned_segments(operator: str) -> None:
+def test_turned_image_has_turned_segments(profile: str, operator: str) -> None:
     """Its mirror image has the same edges; the ends are named anew."""
     image = np.round(60 + 120 * half_plane(100, 140, 20, 70, 50)).astype(np.uint8)
-    straight, mirrored = extract(image, operator=operator), extract(image[:, ::-1], operator=operator)
+    straight, mirrored = (extract(turned, operator=operator, profile=profile) for turned in (image, image[:, ::-1]))
     assert len(straight) == len(mirrored) == 1
     assert straight['theta'][0] == pytest.approx(-mirrored['theta'][0], abs=5e-3)
     assert straight['length'][0] == pytest.approx(mirrored['length'][0], abs=2)
 
 
+@BOTH
 @pytest.mark.parametrize('image', [
     np.zeros((60, 80), np.uint8), np.full((60, 80), 255, np.uint8), np.full((60, 80, 3), 7, np.uint8),
     np.full((60, 80), 65535, np.uint16), np.full((60, 80, 4), 0.5, np.float32),
 ], ids=lambda image: f'{image.dtype} {image.ndim}')
-def test_blank_image_has_no_segment(image: Image) -> None:
-    found = extract(image)
+def test_blank_image_has_no_segment(profile: str, image: Image) -> None:
+    found = extract(image, profile=profile)
     assert found.shape == (0,)
     assert found.dtype == SEGMENT_DTYPE
 
@@ -191,6 +199,7 @@ def read_only(image: Image) -> Image:
     return copied
 
 
+@BOTH
 @pytest.mark.parametrize('layout', [
     padded_rows, every_other, unaligned, read_only, np.asfortranarray,
     lambda image: image[::-1].copy()[::-1], lambda image: image[:, ::-1].copy()[:, ::-1],
@@ -201,28 +210,30 @@ def read_only(image: Image) -> Image:
         'little endian', 'all of it'])
 @pytest.mark.parametrize('dtype', TYPES)
 @pytest.mark.parametrize('channels', [1, 3, 4])
-def test_layout_in_memory_does_not_matter(layout: Any, dtype: Any, channels: int) -> None:
+def test_layout_in_memory_does_not_matter(profile: str, layout: Any, dtype: Any, channels: int) -> None:
     image = scene(dtype=dtype) if channels == 1 else coloured(dtype, channels)
-    expected = extract(image)
+    expected = extract(image, profile=profile)
     before = layout(image)
     kept = before.copy()
     assert len(expected) > 0
-    assert same(extract(before), expected)
+    assert same(extract(before, profile=profile), expected)
     np.testing.assert_array_equal(before, kept)
 
 
+@BOTH
 @pytest.mark.parametrize('dtype', TYPES)
-def test_one_channel_is_grey(dtype: Any) -> None:
+def test_one_channel_is_grey(profile: str, dtype: Any) -> None:
     image = scene(dtype=dtype)
-    assert same(extract(image[:, :, None]), extract(image))
-    assert same(extract(np.moveaxis(image[None], 0, -1)), extract(image))
+    assert same(extract(image[:, :, None], profile=profile), extract(image, profile=profile))
+    assert same(extract(np.moveaxis(image[None], 0, -1), profile=profile), extract(image, profile=profile))
 
 
+@BOTH
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 @pytest.mark.parametrize('channels', [3, 4])
-def test_equal_channels_are_grey(dtype: Any, channels: int) -> None:
+def test_equal_channels_are_grey(profile: str, dtype: Any, channels: int) -> None:
     image = scene(dtype=dtype)
-    assert same(extract(np.repeat(image[:, :, None], channels, 2)), extract(image))
+    assert same(extract(np.repeat(image[:, :, None], channels, 2), profile=profile), extract(image, profile=profile))
 
 
 def test_equal_channels_are_grey_floats() -> None:
@@ -232,13 +243,14 @@ def test_equal_channels_are_grey_floats() -> None:
     np.testing.assert_allclose(grey, image, rtol=1e-6)
 
 
+@BOTH
 @pytest.mark.parametrize('dtype', TYPES)
-def test_alpha_channel_is_ignored(dtype: Any) -> None:
+def test_alpha_channel_is_ignored(profile: str, dtype: Any) -> None:
     image = coloured(dtype, 4)
-    expected = extract(image[:, :, :3])
-    assert same(extract(image), expected)
+    expected = extract(image[:, :, :3], profile=profile)
+    assert same(extract(image, profile=profile), expected)
     image[:, :, 3] = 0
-    assert same(extract(image), expected)
+    assert same(extract(image, profile=profile), expected)
 
 
 @pytest.mark.parametrize('dtype', TYPES)
@@ -251,9 +263,11 @@ def test_colours_are_blue_green_red(dtype: Any) -> None:
     np.testing.assert_allclose(grey, expected, atol=1e-3 if dtype == np.float32 else 1.01)
 
 
+@BOTH
 @pytest.mark.parametrize('operator', ['deriche', 'sobel'])
-def test_every_size(operator: str) -> None:
-    extractor = LineFeatureExtractor(Parameters(operator=operator, min_chain=1, min_size=2, T1=4, T2=2))
+def test_every_size(profile: str, operator: str) -> None:
+    extractor = LineFeatureExtractor(Parameters.profile(
+        profile, operator=operator, min_chain=1, min_size=2, T1=4, T2=2))
     rng = np.random.default_rng(0)
     shapes = [*((1, n) for n in range(1, 71)), *((n, 1) for n in range(1, 71)), *((20, n) for n in range(1, 71)),
               *((n, 21) for n in range(1, 71)), (2, 2), (1, 5000), (5000, 1), (2, 3000), (3000, 2)]
@@ -264,10 +278,11 @@ def test_every_size(operator: str) -> None:
             assert (found[name] <= size - 0.5).all()
 
 
+@BOTH
 @pytest.mark.parametrize('shape', [(1, 1, 1), (1, 1, 3), (1, 1, 4), (1, 7, 3), (7, 1, 4), (2, 2, 1)], ids=str)
 @pytest.mark.parametrize('dtype', TYPES)
-def test_small_colour_images(shape: tuple[int, ...], dtype: Any) -> None:
-    assert extract(np.zeros(shape, dtype)).shape == (0,)
+def test_small_colour_images(profile: str, shape: tuple[int, ...], dtype: Any) -> None:
+    assert extract(np.zeros(shape, dtype), profile=profile).shape == (0,)
 
 
 @pytest.mark.parametrize('shape', [
@@ -312,8 +327,9 @@ def test_pixels_that_are_not_finite(value: float, shape: tuple[int, ...], last: 
         extract(image)
 
 
-def test_extractor_survives_a_wrong_image() -> None:
-    extractor = LineFeatureExtractor()
+@BOTH
+def test_extractor_survives_a_wrong_image(profile: str) -> None:
+    extractor = LineFeatureExtractor(Parameters.profile(profile))
     expected = extractor.extract(scene())
     wrong = scene(dtype=np.float32)
     wrong[3, 3] = np.nan
@@ -356,8 +372,10 @@ def frames() -> list[Image]:
 
 
 @pytest.mark.parametrize('parameters', [
-    Parameters(), Parameters.paper(), Parameters(operator='sobel', orientation='least_squares', n=0, max_gap=0),
-], ids=['default', 'paper', 'other'])
+    Parameters(), Parameters.paper(), Parameters(operator='sobel', orientation='least_squares', max_gap=0),
+    Parameters.profile('paper', operator='sobel', orientation='least_squares', n=0, max_gap=0),
+    Parameters(refine=False), Parameters(grouping='codes'),
+], ids=['default', 'paper', 'other', 'paper other', 'linked', 'codes'])
 def test_frames_do_not_depend_on_those_before(parameters: Parameters) -> None:
     extractor = LineFeatureExtractor(parameters)
     expected = [LineFeatureExtractor(parameters).extract(image) for image in frames()]
@@ -367,10 +385,11 @@ def test_frames_do_not_depend_on_those_before(parameters: Parameters) -> None:
         assert same(extractor.extract(frames()[k]), expected[k]), k
 
 
+@BOTH
 @pytest.mark.parametrize('thinning', Parameters.specs()['thinning'].choices)
-def test_images_of_one_padded_width_do_not_mix(thinning: str) -> None:
+def test_images_of_one_padded_width_do_not_mix(profile: str, thinning: str) -> None:
     """Rows are padded to whole words: what a wider image left in the padding must not be seen."""
-    extractor = LineFeatureExtractor(Parameters(thinning=thinning, min_chain=2))
+    extractor = LineFeatureExtractor(Parameters.profile(profile, thinning=thinning, min_chain=2))
     noise = np.random.default_rng(0).integers(0, 256, (30, 46), np.uint8)
     for width in range(46, 30, -1):
         extractor.extract(noise)
@@ -379,9 +398,10 @@ def test_images_of_one_padded_width_do_not_mix(thinning: str) -> None:
         assert same(extractor.extract(image), fresh)
 
 
-def test_one_extractor_in_two_threads_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+@BOTH
+def test_one_extractor_in_two_threads_is_refused(profile: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It would write into the memory of the other; afterwards it goes on."""
-    extractor = LineFeatureExtractor()
+    extractor = LineFeatureExtractor(Parameters.profile(profile))
     expected = extractor.extract(scene())
     refused = []
 
@@ -405,8 +425,9 @@ def test_warm_up_leaves_out_types_that_the_range_contradicts() -> None:
         extractor.warm_up(np.uint8)
 
 
-def test_results_are_not_overwritten() -> None:
-    extractor = LineFeatureExtractor()
+@BOTH
+def test_results_are_not_overwritten(profile: str) -> None:
+    extractor = LineFeatureExtractor(Parameters.profile(profile))
     first = extractor.extract(scene())
     kept = first.copy()
     second = extractor.extract(scene(seed=1))
@@ -416,8 +437,9 @@ def test_results_are_not_overwritten() -> None:
     assert same(extractor.extract(scene()), kept)
 
 
-def test_stages_are_not_overwritten() -> None:
-    extractor = LineFeatureExtractor()
+@BOTH
+def test_stages_are_not_overwritten(profile: str) -> None:
+    extractor = LineFeatureExtractor(Parameters.profile(profile))
     image = scene()
     first = extractor.stages(image)
     kept = {name: getattr(first, name).copy() for name in FRAMES}
@@ -428,11 +450,12 @@ def test_stages_are_not_overwritten() -> None:
         assert getattr(first, name).tobytes() == kept[name].tobytes(), name
 
 
-def test_image_is_left_alone() -> None:
+@BOTH
+def test_image_is_left_alone(profile: str) -> None:
     for image in frames():
         kept = image.copy()
-        extract(image)
-        LineFeatureExtractor().stages(image)
+        extract(image, profile=profile)
+        LineFeatureExtractor(Parameters.profile(profile)).stages(image)
         np.testing.assert_array_equal(image, kept)
 
 
@@ -448,26 +471,28 @@ def together(count: int, work: Any) -> list[Any]:
         return list(pool.map(wait_and_work, range(count)))
 
 
-def test_function_in_threads() -> None:
+@BOTH
+def test_function_in_threads(profile: str) -> None:
     pictures = frames()
-    expected = [extract(image) for image in pictures]
+    expected = [extract(image, profile=profile) for image in pictures]
 
     def work(k: int) -> bool:
         order = np.random.default_rng(k).permutation(len(pictures))
-        return all(same(extract(pictures[i]), expected[i]) for _ in range(3) for i in order)
+        return all(same(extract(pictures[i], profile=profile), expected[i]) for _ in range(3) for i in order)
 
     assert all(together(8, work))
 
 
 def test_extractors_in_threads() -> None:
     pictures = frames()
-    parameters = [Parameters(), Parameters(operator='sobel'), Parameters(alpha=1.8, n=9), Parameters(max_gap=0, T1=20)]
+    parameters = [Parameters(), Parameters(operator='sobel'), Parameters.paper(),
+                  Parameters.profile('paper', alpha=1.8, n=9), Parameters(max_gap=0, T1=20), Parameters(refine=False)]
     expected = [[LineFeatureExtractor(p).extract(image) for image in pictures] for p in parameters]
 
     def work(k: int) -> bool:
-        extractor = LineFeatureExtractor(parameters[k % 4])
+        extractor = LineFeatureExtractor(parameters[k % 6])
         return all(same(extractor.extract(image), segments)
-                   for _ in range(3) for image, segments in zip(pictures, expected[k % 4], strict=True))
+                   for _ in range(3) for image, segments in zip(pictures, expected[k % 6], strict=True))
 
     assert all(together(8, work))
 
@@ -475,15 +500,16 @@ def test_extractors_in_threads() -> None:
 # What the extractor tells beside the segments.
 
 def test_function_is_the_extractor() -> None:
-    for chosen in ({}, {'T1': 12}, {'alpha': 0.7, 'max_gap': 0}, {'operator': 'sobel'}):
+    for chosen in ({}, {'T1': 12}, {'alpha': 0.7, 'max_gap': 0}, {'operator': 'sobel'}, {'refine': False}):
         assert same(extract(scene(), **chosen), LineFeatureExtractor(Parameters(**chosen)).extract(scene()))
     expected = LineFeatureExtractor(Parameters.profile('paper', T1=12)).extract(scene())
     assert same(extract(scene(), profile='paper', T1=12), expected)
     assert same(extract(scene(), profile='default'), extract(scene()))
 
 
-def test_times() -> None:
-    extractor = LineFeatureExtractor()
+@BOTH
+def test_times(profile: str) -> None:
+    extractor = LineFeatureExtractor(Parameters.profile(profile))
     assert list(extractor.times) == list(STEPS)
     extractor.extract(scene())
     assert list(extractor.times) == list(STEPS)
@@ -491,30 +517,32 @@ def test_times() -> None:
     assert sum(extractor.times.values()) > 0
 
 
-def test_unlinked_counts_segments_before_linking() -> None:
-    extractor = LineFeatureExtractor(Parameters(min_length=0))
+@BOTH
+def test_unlinked_counts_segments_before_linking(profile: str) -> None:
+    extractor = LineFeatureExtractor(Parameters.profile(profile, min_length=0))
     for image in (scene(), np.zeros((9, 9), np.uint8), scene(seed=3)):
         segments = extractor.extract(image)
         assert extractor.unlinked >= len(segments)
         assert extractor.unlinked == len(extractor.stages(image).unlinked)
-    assert LineFeatureExtractor().unlinked == 0
+    assert LineFeatureExtractor(Parameters.profile(profile)).unlinked == 0
 
 
 def test_linking_only_joins() -> None:
     """No edge pixel is lost or counted twice by it."""
     for seed in range(4):
-        stages = LineFeatureExtractor(Parameters(max_segments=2)).stages(scene(seed=seed))
+        stages = LineFeatureExtractor(Parameters.profile('paper', max_segments=2)).stages(scene(seed=seed))
         assert stages.unlinked['size'].sum() == stages.linked['size'].sum()
         assert len(stages.linked) <= len(stages.unlinked)
         assert len(stages.segments) < len(stages.linked)
 
 
-def test_linked_are_all_segments_whatever_is_selected() -> None:
+@BOTH
+def test_linked_are_all_segments_whatever_is_selected(profile: str) -> None:
     """In the order of the result, which leaves some out."""
-    plain = LineFeatureExtractor(Parameters(min_length=0)).stages(scene(seed=1))
+    plain = LineFeatureExtractor(Parameters.profile(profile, min_length=0)).stages(scene(seed=1))
     assert same(plain.linked, plain.segments)
     for chosen in ({'min_length': 20}, {'max_segments': 3}, {'theta_min': 0, 'theta_max': 1}, {'min_length': 1e5}):
-        stages = LineFeatureExtractor(Parameters(**chosen)).stages(scene(seed=1))
+        stages = LineFeatureExtractor(Parameters.profile(profile, **chosen)).stages(scene(seed=1))
         assert same(stages.linked, plain.linked)
         chosen_bytes = {segment.tobytes() for segment in stages.segments}
         left = [k for k, segment in enumerate(plain.linked) if segment.tobytes() in chosen_bytes]
@@ -522,8 +550,9 @@ def test_linked_are_all_segments_whatever_is_selected() -> None:
         assert same(stages.segments, plain.linked[left])
 
 
-def test_linked_and_segments_are_arrays_of_their_own() -> None:
-    stages = LineFeatureExtractor(Parameters(min_length=0)).stages(scene())
+@BOTH
+def test_linked_and_segments_are_arrays_of_their_own(profile: str) -> None:
+    stages = LineFeatureExtractor(Parameters.profile(profile, min_length=0)).stages(scene())
     linked = stages.linked.copy()
     stages.segments['x'] = -1
     assert same(stages.linked, linked)
@@ -564,10 +593,15 @@ def check_chains(stages: Stages, parameters: Parameters) -> None:
     else:
         assert offsets[-1] == len(pixels)
     assert len(stages.closed) == len(offsets) - 1
-    assert (np.diff(offsets) >= parameters.min_chain).all()
+    if parameters.refine and parameters.thinning != 'none':
+        # Chains as they were traced: every edge pixel is in one, and lines grow over gaps by themselves.
+        assert len(pixels) == (stages.edges != 0).sum()
+        assert not stages.closed.any()
+    else:
+        assert (np.diff(offsets) >= parameters.min_chain).all()
     if parameters.n == 0:
         np.testing.assert_array_equal(stages.codes_before, stages.codes_after)
-    if parameters.max_gap == 0:
+    if parameters.max_gap == 0 or parameters.refine:
         assert not stages.bridged.any()
     for first, end, closed in zip(offsets[:-1], offsets[1:], stages.closed, strict=True):
         chain, directions = pixels[first:end], stages.chain_directions[first:end]
@@ -585,6 +619,28 @@ def check_chains(stages: Stages, parameters: Parameters) -> None:
             assert stages.codes_before[first + k] == stages.codes_before[first + k - 1]
         runs = ''.join('b' if flag else ' ' for flag in bridged).split()
         assert max((len(run) for run in runs), default=0) <= parameters.max_gap
+
+
+def check_stretches(stages: Stages, parameters: Parameters) -> None:
+    """Blobs are stretches of chains, none of them twice, with the code that most of their pixels have."""
+    pixels, width = stages.chain_pixels.astype(np.int64), stages.grey.shape[1]
+    places = {place: k for k, place in enumerate((pixels[:, 1] * width + pixels[:, 0]).tolist())}
+    chain_of = np.searchsorted(stages.chain_offsets, np.arange(len(pixels)), 'right')
+    last = -1
+    assert len(stages.blob_pixels) == stages.blob_offsets[-1]
+    assert len(stages.blob_offsets) == len(stages.blobs) + 1
+    for k, blob in enumerate(stages.blobs):
+        columns, rows = stages.blob_pixels[stages.blob_offsets[k]:stages.blob_offsets[k + 1]].astype(np.int64).T
+        members = np.array([places[place] for place in (rows * width + columns).tolist()])
+        assert blob['select']
+        assert len(members) == blob['size'] >= parameters.min_size
+        assert members[0] > last
+        assert (np.diff(members) == 1).all()
+        assert len(set(chain_of[members].tolist())) == 1
+        assert blob['dir'] == 1 + np.bincount(stages.codes_before[members], minlength=5)[1:].argmax()
+        assert (blob['min_row'], blob['max_row']) == (rows.min(), rows.max())
+        assert (blob['min_col'], blob['max_col']) == (columns.min(), columns.max())
+        last = members[-1]
 
 
 def check_blobs(stages: Stages) -> None:
@@ -639,10 +695,22 @@ def check_moments(stages: Stages, parameters: Parameters) -> None:
 
 def check_segments(segments: npt.NDArray[np.void], height: int, width: int, parameters: Parameters) -> None:
     assert segments.dtype == SEGMENT_DTYPE
-    for name in SEGMENT_DTYPE.names or ():
-        assert name == 'intercept' or np.isfinite(segments[name]).all(), name
+    for name in set(SEGMENT_DTYPE.names or ()) - {'intercept', *OF_REFINED}:
+        assert np.isfinite(segments[name]).all(), name
+    if parameters.refine:
+        for name in OF_REFINED:
+            assert np.isfinite(segments[name]).all(), name
+        for name in ('sigma_theta', 'sigma_offset', 'contrast'):
+            assert (segments[name] >= 0).all(), name
+        assert np.isin(segments['polarity'], [-1, 1]).all()
+        assert (segments['log_nfa'] <= math.log10(parameters.false_alarms) + 1e-4).all()
+        assert (segments['size'] > 0).all()
+    else:
+        for name in OF_REFINED:
+            assert name == 'polarity' or np.isnan(segments[name]).all(), name
+        assert (segments['polarity'] == 0).all()
+        assert (segments['size'] >= parameters.min_size).all()
     assert np.isin(segments['code'], [1, 2, 3, 4]).all()
-    assert (segments['size'] >= parameters.min_size).all()
     assert (segments['length'] >= parameters.min_length * (1 - 1e-6)).all()
     assert (segments['z'] == 0).all()
     assert (abs(segments['theta']) <= np.float32(math.pi / 2)).all()
@@ -673,19 +741,24 @@ def check_everything(image: Image, parameters: Parameters) -> Stages:
     assert same(stages.segments, extractor.extract(image))
     check_edges(stages)
     check_chains(stages, parameters)
-    check_blobs(stages)
+    if parameters.grouping == 'codes' or parameters.thinning == 'none':
+        check_blobs(stages)
+    else:
+        check_stretches(stages, parameters)
+        np.testing.assert_array_equal(stages.codes_before, stages.codes_after)
     check_moments(stages, parameters)
-    check_segments(stages.unlinked, height, width, dataclasses.replace(parameters, min_length=0))
+    check_segments(stages.unlinked, height, width, dataclasses.replace(parameters, min_length=0, refine=False))
     check_segments(stages.linked, height, width, dataclasses.replace(parameters, min_length=0))
     check_segments(stages.segments, height, width, parameters)
     assert same(stages.segments, stages.linked[stages.linked['length'] >= np.float32(parameters.min_length)])
     return stages
 
 
+@BOTH
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('sigma', [0, 4, 30])
-def test_rendered_images(seed: int, sigma: float) -> None:
-    stages = check_everything(scene(seed=seed, sigma=sigma), Parameters(min_chain=4))
+def test_rendered_images(profile: str, seed: int, sigma: float) -> None:
+    stages = check_everything(scene(seed=seed, sigma=sigma), Parameters.profile(profile, min_chain=4))
     assert len(stages.segments) > 2
 
 
@@ -696,17 +769,18 @@ def test_hysteresis_of_noise(operator: str) -> None:
     for seed in range(10):
         image = np.random.default_rng(seed).integers(0, 256, (60, 70), np.uint8)
         for T1 in (15, 20, 40):
-            stages = LineFeatureExtractor(Parameters(operator=operator, T1=T1, T2=12)).stages(image)
+            stages = LineFeatureExtractor(Parameters.profile('paper', operator=operator, T1=T1, T2=12)).stages(image)
             check_edges(stages)
             some += 0 < (stages.edges != 0).sum() < (stages.candidates != 0).sum()
     assert some > 5
 
 
-def test_rings_are_closed() -> None:
+@pytest.mark.parametrize('parameters', [Parameters.paper(), Parameters(refine=False)], ids=['codes', 'straightness'])
+def test_rings_are_closed(parameters: Parameters) -> None:
     """The outline of a disc is one closed chain."""
     y, x = np.mgrid[:80, :80]
     image = (60 + 120 * np.clip(25.5 - np.hypot(x - 40.2, y - 39.6), 0, 1)).astype(np.uint8)
-    stages = check_everything(image, Parameters())
+    stages = check_everything(image, parameters)
     assert stages.closed.tolist() == [True]
     assert set(stages.codes_after) == {1, 2, 3, 4}
 
@@ -745,10 +819,13 @@ images = st.builds(
     st.sampled_from(['noise', 'two levels', 'checkerboard', 'stripes', 'edges', 'rings', 'extreme', 'constant']),
     st.integers(1, 64), st.integers(1, 64), st.sampled_from(TYPES), st.integers(0, 10**6),
     st.sampled_from([1, 1, 3, 4]))
+profiles = st.sampled_from(['default', 'paper'])
 thresholds = st.lists(st.floats(0, 60) | st.floats(0, 1000), min_size=2, max_size=2, unique=True).map(sorted)
 parameter_sets = st.builds(
-    lambda levels, **others: Parameters(T2=levels[0], T1=levels[1], **others), thresholds,
-    operator=st.sampled_from(Parameters.specs()['operator'].choices), alpha=st.floats(0.2, 5), sigma=st.floats(0.3, 10),
+    lambda profile, levels, **others: Parameters.profile(profile, T2=levels[0], T1=levels[1], **others),
+    profiles, thresholds,
+    operator=st.sampled_from(Parameters.specs()['operator'].choices),
+    alpha=st.floats(0.2, 5), sigma=st.floats(0.3, 10),
     thinning=st.sampled_from(['suppression', *Parameters.specs()['thinning'].choices]), max_gap=st.integers(0, 8),
     min_chain=st.integers(1, 12), n=st.integers(0, 12) | st.integers(0, 10000), min_size=st.integers(2, 12),
     orientation=st.sampled_from(['principal_axis', 'least_squares']), tau1=st.floats(0, 5) | st.floats(0, 20),
@@ -762,18 +839,36 @@ def test_any_image_and_parameters(image: Image, parameters: Parameters) -> None:
     check_everything(image, parameters)
 
 
+beyond_the_paper = st.fixed_dictionaries({}, optional={
+    'alpha': st.just(math.nan), 'noise_T1': st.floats(0, 100), 'noise_T2': st.floats(0, 100),
+    'grouping': st.sampled_from(['codes', 'straightness']), 'refine': st.booleans(), 'min_snr': st.floats(0, 100),
+    'false_alarms': st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), 'operator': st.just('sobel'),
+    'thinning': st.sampled_from(['morphological', 'none']), 'min_chain': st.integers(1, 12),
+    'min_size': st.integers(2, 12), 'max_gap': st.integers(0, 8)})
+
+
+@settings(max_examples=250, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+@given(profiles, images, thresholds, beyond_the_paper)
+def test_any_image_beyond_the_paper(
+    profile: str, image: Image, levels: list[float], chosen: dict[str, Any],
+) -> None:
+    """Each step that the paper does not have, with and without the others."""
+    check_everything(image, Parameters.profile(profile, T2=levels[0], T1=levels[1], **chosen))
+
+
 @settings(max_examples=150, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
-@given(images, st.sampled_from([0.5, 2.0, 10.0]), st.integers(0, 8))
-def test_any_image_with_low_thresholds(image: Image, T1: float, max_gap: int) -> None:
+@given(profiles, images, st.sampled_from([0.5, 2.0, 10.0]), st.integers(0, 8))
+def test_any_image_with_low_thresholds(profile: str, image: Image, T1: float, max_gap: int) -> None:
     """Where almost everything is an edge."""
-    check_everything(image, Parameters(T1=T1, T2=T1 / 8, max_gap=max_gap, min_chain=2, min_size=2, tau1=2, tau2=10))
+    check_everything(image, Parameters.profile(
+        profile, T1=T1, T2=T1 / 8, max_gap=max_gap, min_chain=2, min_size=2, tau1=2, tau2=10))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
-@given(images, images)
-def test_any_two_images(first: Image, second: Image) -> None:
+@given(profiles, images, images)
+def test_any_two_images(profile: str, first: Image, second: Image) -> None:
     """What an extractor saw before does not matter."""
-    extractor = LineFeatureExtractor()
-    expected = [LineFeatureExtractor().extract(image) for image in (first, second)]
+    extractor = LineFeatureExtractor(Parameters.profile(profile))
+    expected = [LineFeatureExtractor(Parameters.profile(profile)).extract(image) for image in (first, second)]
     assert [same(extractor.extract(image), segments) for image, segments in
             zip((first, second, first), (*expected, expected[0]), strict=True)] == [True] * 3

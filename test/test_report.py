@@ -150,12 +150,12 @@ def test_many_reasons_are_summed_up():
 
 
 def test_parameters_that_differ_are_told():
-    made = read(outcome(frames(3)), run=Run(Job(Parameters.profile('corridor', n=4, alpha=2.0)), every=5, start=1.5),
-                profile='corridor')
+    chosen = Parameters.profile('corridor', min_length=20.0, alpha=2.0)
+    made = read(outcome(frames(3)), run=Run(Job(chosen), every=5, start=1.5), profile='corridor')
     rows = {row[0]: row[1:4] for row in made.rows}
-    assert rows['T1'] == ['5', '5', '8']
-    assert rows['n'] == ['4', '2', '4']
-    assert rows['alpha'] == ['2', '1', '1']
+    assert rows['T1'] == ['5', '5', '4']
+    assert rows['min_length'] == ['20', '12', '0']
+    assert rows['alpha'] == ['2', 'unset', 'unset']
     assert 'tau1' not in rows
     assert 'Profile corridor. Frames: one of 5 frames, from 1.5 s.' in made.text
 

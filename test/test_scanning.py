@@ -1,3 +1,4 @@
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.edges import MARGIN, STRONG
 from line_feature_node.core.parameters import Parameters
-from line_feature_node.core.scanning import TAKEN, scan_edges
+from line_feature_node.core.scanning import TAKEN, chain_directions, scan_edges
 
 Pixel = tuple[int, int]
 
@@ -51,9 +52,12 @@ def marks_of(codes: NDArray[np.uint8], strong: Any = True) -> NDArray[np.uint8]:
 
 def scan(
     codes: NDArray[np.uint8], strong: Any = True, max_gap: int = 0, min_chain: int = 1, buffers: Buffers | None = None,
+    refine: bool = False,
 ) -> list[Chain]:
     marks = marks_of(codes, strong)
-    chains = scan_edges(marks, Parameters(max_gap=max_gap, min_chain=min_chain), buffers or Buffers())
+    chains = scan_edges(
+        marks, Parameters(max_gap=max_gap, min_chain=min_chain, refine=refine), buffers or Buffers())
+    directions = chain_directions(chains, marks.shape[1])
     rows, columns = np.divmod(chains.pixels, marks.shape[1])
     assert chains.offsets.size == chains.closed.size + 1
     assert chains.offsets[0] == 0
@@ -62,7 +66,7 @@ def scan(
     for k, closed in enumerate(chains.closed):
         part = slice(chains.offsets[k], chains.offsets[k + 1])
         pixels = list(zip((columns[part] - MARGIN).tolist(), (rows[part] - MARGIN).tolist(), strict=True))
-        found.append(Chain(pixels, chains.codes[part].tolist(), chains.directions[part].tolist(),
+        found.append(Chain(pixels, chains.codes[part].tolist(), directions[part].tolist(),
                            chains.bridged[part].tolist(), bool(closed)))
     return found
 
@@ -128,6 +132,26 @@ def test_random_images(density: float, max_gap: int, shape: tuple[int, int]) -> 
         check(scan(codes, strong, max_gap, buffers=buffers), codes, strong & (codes > 0))
 
 
+@pytest.mark.parametrize('density', [0.05, 0.3, 0.8])
+def test_chains_that_are_refined_are_those_that_were_traced(density: float) -> None:
+    """All of their pixels and none linked, whatever max_gap and min_chain are; nor does any count as closed."""
+    rng = np.random.default_rng(round(1000 * density))
+    buffers = Buffers()
+    for shape in ((60, 83), (9, 7), (60, 83), (1, 1), (40, 120)):
+        codes = np.where(rng.random(shape) < density, rng.integers(1, 5, shape), 0).astype(np.uint8)
+        strong = rng.random(shape) < 0.05
+        linked = scan(codes, strong, max_gap=0, min_chain=1)
+        found = scan(codes, strong, max_gap=4, min_chain=9, buffers=buffers, refine=True)
+        assert len(found) >= len(linked)
+        pixels, of_linked = (sorted(pixel for chain in some for pixel in zip(chain.pixels, chain.codes, strict=True))
+                             for some in (found, linked))
+        assert pixels == of_linked
+        for chain in found:
+            assert all(max(abs(x - u), abs(y - v)) == 1 for (x, y), (u, v) in itertools.pairwise(chain.pixels))
+        assert not any(chain.closed or any(chain.bridged) for chain in found)
+        scan(codes, strong, max_gap=4, min_chain=2, buffers=buffers)
+
+
 SMALL = st.tuples(st.integers(1, 10), st.integers(1, 18))
 
 
@@ -183,7 +207,7 @@ def test_visited_pixels_are_taken() -> None:
         ...dd...
         """.replace(' ', ''))
     marks = marks_of(codes, strong)
-    scan_edges(marks, Parameters(max_gap=0, min_chain=1), Buffers())
+    scan_edges(marks, Parameters.profile('paper', max_gap=0, min_chain=1), Buffers())
     taken = marks[MARGIN:-MARGIN, MARGIN:MARGIN + codes.shape[1]] & TAKEN > 0
     assert set(zip(*np.nonzero(taken.T), strict=True)) == {(0, 0), (1, 0), (2, 0), (5, 0)}
 

@@ -7,6 +7,7 @@ from line_feature_node.core import LineFeatureExtractor, Parameters, extract
 from line_feature_node.core.edges import STRONG
 from line_feature_node.core.thinning import connected, thin
 
+BOTH = pytest.mark.parametrize('profile', ['default', 'paper'])
 BAR = np.pad(np.full((6, 60), 1 | STRONG, np.uint8), 12)
 
 
@@ -60,17 +61,19 @@ def test_thinning_keeps_what_hangs_together_and_nothing_thick(seed):
     assert squares < 0.02 * after.sum()
 
 
+@BOTH
 @pytest.mark.parametrize('seed', range(3))
-def test_thick_edges_hold_what_suppression_leaves(seed):
+def test_thick_edges_hold_what_suppression_leaves(profile, seed):
     """The same thresholds: hysteresis alone has every pixel that stays when non-maxima are taken away first."""
-    thick, thinned = (LineFeatureExtractor(Parameters(thinning=way)).stages(picture(seed))
+    thick, thinned = (LineFeatureExtractor(Parameters.profile(profile, thinning=way)).stages(picture(seed))
                       for way in ('none', 'suppression'))
     assert np.all((thinned.edges != 0) <= (thick.edges != 0))
     assert (thick.edges != 0).sum() > 2 * (thinned.edges != 0).sum()
 
 
-def test_thick_edges_have_no_chains_and_blobs_of_all_pixels():
-    stages = LineFeatureExtractor(Parameters(thinning='none')).stages(picture())
+@BOTH
+def test_thick_edges_have_no_chains_and_blobs_of_all_pixels(profile):
+    stages = LineFeatureExtractor(Parameters.profile(profile, thinning='none')).stages(picture())
     assert stages.chain_offsets.tolist() == [0]
     assert len(stages.blob_pixels) == (stages.edges != 0).sum() > 0
     np.testing.assert_array_equal(stages.codes_before, stages.codes_after)
@@ -79,17 +82,19 @@ def test_thick_edges_have_no_chains_and_blobs_of_all_pixels():
         assert (stages.blobs['dir'][stages.blobs['select']] == code).sum() == count
 
 
+@BOTH
 @pytest.mark.parametrize('thinning', ['none', 'morphological'])
 @pytest.mark.parametrize('shape', [(1, 1), (1, 9), (9, 1), (40, 50)])
-def test_any_size_and_blank_images(thinning, shape):
-    assert len(extract(np.full(shape, 77, np.uint8), thinning=thinning)) == 0
+def test_any_size_and_blank_images(profile, thinning, shape):
+    assert len(extract(np.full(shape, 77, np.uint8), thinning=thinning, profile=profile)) == 0
     noise = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
-    found = extract(noise, thinning=thinning)
+    found = extract(noise, thinning=thinning, profile=profile)
     assert np.all(found['x1'] >= -0.5)
 
 
-def test_morphological_edges_are_chained_and_thin():
-    stages = LineFeatureExtractor(Parameters(thinning='morphological')).stages(picture())
+@BOTH
+def test_morphological_edges_are_chained_and_thin(profile):
+    stages = LineFeatureExtractor(Parameters.profile(profile, thinning='morphological')).stages(picture())
     assert len(stages.chain_offsets) > 2
     squares = cv2.erode((stages.candidates != 0).astype(np.uint8), np.ones((2, 2), np.uint8)).sum()
     assert squares < 0.05 * (stages.candidates != 0).sum()

@@ -32,3 +32,7 @@ class Buffers:
         if array is None or array.shape != (height, width):
             array = self._arrays[name] = np.zeros((height, width), dtype)
         return array
+
+    def last(self, name: str) -> NDArray[Any]:
+        """The array that was last asked for by this name."""
+        return self._arrays[name]

@@ -38,6 +38,8 @@ ONE = np.float32(1)
 NO_MARK, CODE_1, CODE_2, CODE_3, CODE_4, STRONG_MARK = (np.uint8(mark) for mark in (0, 1, 2, 3, 4, STRONG))
 #: Half a section of the gradient space is 22.5 degrees.
 SECTION = np.float32(math.tan(math.pi / 8))
+#: Names of the components of the gradient among the buffers.
+GRADIENT = ('gx', 'gy')
 #: Added to every pixel: the recursion would fade into denormal numbers, which are slow, beside a black area.
 PEDESTAL = 1.0
 
@@ -61,7 +63,10 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     # Whole strips of rows and whole tiles of columns fit in, with the padding.
     lines, columns = -(-height // LANES) * LANES, -(-(width + 2 * PAD) // TILE) * TILE
     plane = buffers.image('plane', lines + 2 * PAD, columns, np.float32)
-    rows = buffers.image('rows', 15, columns, np.float32)
+    rows = buffers.image('rows', 9, columns, np.float32)
+    # Refinement looks at the gradient; without, only three rows are needed at a time.
+    depth = lines + 2 * PAD if parameters.refine else 3
+    gx, gy = (buffers.image(name, depth, columns, np.float32) for name in GRADIENT)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     # An image of another width may have had the same padded one, and pixels where the padding is now.
     marks[:, MARGIN + width:] = 0
@@ -81,8 +86,14 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
         cv2.GaussianBlur(plane[inside], (0, 0), parameters.sigma, dst=smoothed[inside], borderType=cv2.BORDER_REPLICATE)
         plane = smoothed
     sweep(height, width, recursive, q, side, centre, parameters.T1, parameters.T2,
-          parameters.thinning == 'suppression', plane, rows, marks)
+          parameters.thinning == 'suppression', plane, rows, gx, gy, marks)
     return marks
+
+
+def kept_gradient(buffers: Buffers) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Components of the gradient of the last image, padded by PAD, where lines are refined."""
+    gx, gy = (buffers.last(name) for name in GRADIENT)
+    return gx, gy
 
 
 def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float, float]:
@@ -260,16 +271,17 @@ def start_upwards(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
 @kernel
 def sweep(
     height: int, width: int, recursive: bool, q: float, side: float, centre: float, T1: float, T2: float, thin: bool,
-    plane: Any, rows: Any, marks: Any,
+    plane: Any, rows: Any, gx: Any, gy: Any, marks: Any,
 ) -> None:
     """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it.
 
-    Only a few rows are written besides the marks; to smooth the plane in place would push the marks out of the cache,
+    The gradient goes into arrays of as many rows as the plane has, or of three that are used in turn. But for these
+    only a few rows are written besides the marks; to smooth the plane in place would push the marks out of the cache,
     which are read next.
     """
     b, a = np.float32(side), np.float32(centre)
-    across, along = rows[0], rows[1]
-    gx, gy, norm, smooth = rows[3:6], rows[6:9], rows[9:12], rows[12:15]
+    across, along, norm, smooth = rows[1], rows[2], rows[3:6], rows[6:9]
+    depth = gx.shape[0]
     for row in (height + PAD, height + PAD + 1):
         copy_row(plane[row], smooth[row % 3])
     for row in range(height + PAD - 1, -1, -1):
@@ -279,10 +291,10 @@ def sweep(
         else:
             copy_row(plane[row], smooth[below])
         combine_columns(smooth[below], smooth[above], smooth[middle], b, a, across, along)
-        gradient(across, along, b, a, gx[above], gy[above], norm[above])
+        gradient(across, along, b, a, gx[(row + 1) % depth], gy[(row + 1) % depth], norm[above])
         if row < height:
-            suppress(norm[above], norm[middle], norm[below], gx[middle], gy[middle], np.float32(T1), np.float32(T2),
-                     thin, marks[row + MARGIN, MARGIN:MARGIN + width])
+            suppress(norm[above], norm[middle], norm[below], gx[(row + 2) % depth], gy[(row + 2) % depth],
+                     np.float32(T1), np.float32(T2), thin, marks[row + MARGIN, MARGIN:MARGIN + width])
 
 
 @inlined

@@ -23,7 +23,16 @@ SEGMENT_DTYPE = np.dtype([
     ('rho', np.float32),                                        # -x sin(theta) + y cos(theta): distance from the origin
     ('code', np.uint32),                                        # gradient direction code, 1 to 4
     ('size', np.uint32),                                        # edge pixels
+    # The rest is known of refined segments only: NaN, and polarity 0, of others.
+    ('sigma_theta', np.float32),                                # standard deviation of theta
+    ('sigma_offset', np.float32),                               # and of the mid-point's position across the segment
+    ('contrast', np.float32),                                   # grey levels of the step across it
+    ('polarity', np.int32),                                     # 1: brighter on the side of (-sin, cos); -1: darker
+    ('log_nfa', np.float32),                                    # log10 of the number of false alarms as clear as this
 ])
+
+#: What the fields have that are known of refined segments only, in others.
+UNREFINED = {'sigma_theta': np.nan, 'sigma_offset': np.nan, 'contrast': np.nan, 'polarity': 0, 'log_nfa': np.nan}
 
 #: A line while it is computed: sums over its pixels, its minimum rectangle, and what follows from them.
 LINE_DTYPE = np.dtype([
@@ -225,4 +234,6 @@ def write_segments(lines: Any, alive: Any, segments: Any) -> None:
         segment['rho'] = line['y'] * cos - line['x'] * sin
         segment['code'] = line['code']
         segment['size'] = line['n']
+        segment['sigma_theta'], segment['sigma_offset'] = np.nan, np.nan
+        segment['contrast'], segment['polarity'], segment['log_nfa'] = np.nan, 0, np.nan
         count += 1

@@ -109,16 +109,22 @@ class Parameters(ParameterSet):
         'deriche', 'Edge operator; dog is the derivative of a Gaussian.',
         choices=('deriche', 'sobel', 'prewitt', 'scharr', 'dog'))
     alpha: float = parameter(
-        1.0, "Width of Deriche's operator: smaller smooths more.", low=0.2, high=5.0, unit='1/pixel')
+        math.nan, "Width of Deriche's operator: smaller smooths more; unset: chosen from the noise of the picture.",
+        low=0.2, high=5.0, unit='1/pixel', unset=True)
     sigma: float = parameter(
         1.0, 'Standard deviation of the Gaussian, for the operator dog: larger smooths more.',
         low=0.3, high=10.0, unit='pixels')
     T1: float = parameter(
-        8.0, 'Upper threshold of the hysteresis: a stronger gradient is an edge.',
+        4.0, 'Upper threshold of the hysteresis: a stronger gradient is an edge.',
         low=0.0, high=1000.0, unit='grey levels/pixel')
     T2: float = parameter(
-        3.0, 'Lower threshold of the hysteresis, less than T1: a stronger gradient is an edge where connected to one.',
+        2.0, 'Lower threshold of the hysteresis, less than T1: a stronger gradient is an edge where connected to one.',
         low=0.0, high=1000.0, unit='grey levels/pixel')
+    noise_T1: float = parameter(
+        4.0, "T1 is raised to so many standard deviations of the gradient's noise, which is measured in the picture.",
+        low=0.0, high=100.0)
+    noise_T2: float = parameter(
+        2.0, "T2 is raised to so many standard deviations of the gradient's noise.", low=0.0, high=100.0)
     intensity_min: float = parameter(
         math.nan, 'Pixel value that counts as grey level 0; unset: 0.', low=-1e9, high=1e9, unset=True)
     intensity_max: float = parameter(
@@ -131,6 +137,9 @@ class Parameters(ParameterSet):
     min_chain: int = parameter(8, 'Shorter edge chains are dropped.', low=1, high=100000, unit='pixels')
     n: int = parameter(
         4, 'Window of the edge normalisation, before and after; 0 turns it off.', low=0, high=10000, unit='pixels')
+    grouping: str = parameter(
+        'straightness', 'What makes a line-blob of edge pixels: one code after the edge normalisation, or a straight '
+        'stretch of a chain.', choices=('codes', 'straightness'))
     min_size: int = parameter(5, 'Smaller line-blobs give no segment.', low=2, high=100000, unit='pixels')
     orientation: str = parameter(
         'principal_axis', 'How the orientation of a line-blob is computed.',
@@ -141,8 +150,17 @@ class Parameters(ParameterSet):
     tau2: float = parameter(
         6.0, 'Linked segments have two end points nearer than this to each other.',
         low=0.0, high=100.0, unit='pixels')
+    refine: bool = parameter(
+        True, 'Lines are laid along the ridge of the gradient, grown as far as it goes, and dropped where they may be '
+        'there by chance; there is no linking then.')
+    min_snr: float = parameter(
+        25.0, 'Refined segments are kept from this ratio of signal to noise: gradient by root of length, in standard '
+        "deviations of the gradient's noise.", low=0.0, high=1000.0)
+    false_alarms: float = parameter(
+        0.1, 'Refined segments are dropped where so many as clear as they are expected by chance in a picture whose '
+        'gradients have no order.', low=1e-30, high=1e30)
     min_length: float = parameter(
-        0.0, 'Shorter segments are dropped after linking.', low=0.0, high=100000.0, unit='pixels')
+        0.0, 'Shorter segments are dropped in the end.', low=0.0, high=100000.0, unit='pixels')
     max_segments: int = parameter(
         0, 'At most this many segments, the longest, are kept; 0 keeps all.', low=0, high=1000000)
     theta_min: float = parameter(
@@ -168,6 +186,11 @@ class Parameters(ParameterSet):
             raise ValueError(f'roi must have a width and a height above 0, got {list(self.roi)}')
         if max(self.roi) > 1 and not all(value.is_integer() for value in self.roi):
             raise ValueError(f'roi must be shares of 0 to 1 or whole pixels, got {list(self.roi)}')
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether alpha or the thresholds depend on the noise."""
+        return math.isnan(self.alpha) or self.noise_T1 > 0 or self.noise_T2 > 0
 
     @classmethod
     def paper(cls) -> 'Parameters':

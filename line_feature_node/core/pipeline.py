@@ -15,17 +15,21 @@ from numpy.typing import NDArray
 
 from line_feature_node.core.blobs import extract_blobs
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.edges import CODE, MARGIN, STRONG, extract_edges
+from line_feature_node.core.edges import CODE, MARGIN, PAD, STRONG, extract_edges, kept_gradient
 from line_feature_node.core.features import compute_lines, segments_of
 from line_feature_node.core.linking import link_lines
+from line_feature_node.core.noise import adapted, correlation_length, gradient_noise, measure, step_response
 from line_feature_node.core.normalization import normalize_codes
 from line_feature_node.core.parameters import Parameters
-from line_feature_node.core.scanning import BRIDGED, TAKEN, scan_edges
+from line_feature_node.core.refinement import Ridges, refine_lines
+from line_feature_node.core.scanning import BRIDGED, TAKEN, chain_directions, scan_edges
 from line_feature_node.core.selection import check_mask, enlarged, filled, placed, region, selected, smaller
+from line_feature_node.core.splitting import deviation_variance, split_chains
 from line_feature_node.core.thinning import thin, unscanned
 
-#: What a frame goes through, as `times` names it: `input` is the check and the conversion to grey.
-STEPS = ('input', 'edges', 'scanning', 'normalization', 'blobs', 'features', 'linking')
+#: What a frame goes through, as `times` names it: `input` is the check, the conversion to grey and the measuring of the
+#: noise. Of linking and refinement one takes place.
+STEPS = ('input', 'edges', 'scanning', 'normalization', 'blobs', 'features', 'linking', 'refinement')
 
 #: Types of pixels that an image may have.
 PIXEL_TYPES = (np.uint8, np.uint16, np.float32)
@@ -63,7 +67,7 @@ class Stages:
         blob_pixels: Pixels of the line-blobs.
         blob_offsets: int32, where each blob starts.
         unlinked: SEGMENT_DTYPE, segments before linking.
-        linked: SEGMENT_DTYPE, all segments after linking.
+        linked: SEGMENT_DTYPE, all segments after linking or refinement.
         segments: SEGMENT_DTYPE, the result: those of them that are selected, in pixels of the full picture.
     """
 
@@ -214,8 +218,12 @@ class LineFeatureExtractor:
 
     def _steps(self, image: NDArray[Any], mask: NDArray[Any] | None, watch: Watch) -> NDArray[np.void]:
         """The steps in their order; `watch` sees the result of each before the next one works on it."""
-        p, buffers = self.parameters, self._buffers
-        grey, keep, view = working_picture(image, mask, p, buffers)
+        buffers = self._buffers
+        grey, keep, view = working_picture(image, mask, self.parameters, buffers)
+        p, noise = self.parameters, 0.0
+        if p.refine or p.adaptive or p.grouping == 'straightness':
+            quality = measure(grey, p, buffers, keep)
+            p, noise = adapted(p, quality), quality.noise
         watch('input', grey)
         marks = extract_edges(grey, p, buffers)
         self._view, self._marks = view, marks
@@ -227,20 +235,42 @@ class LineFeatureExtractor:
         watch('edges', marks)
         chains = unscanned(marks) if p.thinning == 'none' else scan_edges(marks, p, buffers)
         watch('scanning', (chains, marks))
-        normalize_codes(chains, p.n)
+        by_codes = p.grouping == 'codes' or p.thinning == 'none'
+        normalize_codes(chains, p.n if by_codes else 0)
         watch('normalization', chains.codes)
-        blobs = extract_blobs(chains.pixels, chains.codes, marks.shape, MARGIN, buffers)
+        if by_codes:
+            blobs = extract_blobs(chains.pixels, chains.codes, marks.shape, MARGIN, buffers)
+        else:
+            variance = deviation_variance(noise * gradient_noise(p), p.T1)
+            blobs = split_chains(chains, variance, marks.shape[1], MARGIN, p.min_size, buffers)
         watch('blobs', blobs)
         lines, count = compute_lines(blobs, chains.pixels, chains.bridged, marks.shape[1], MARGIN, grey.shape, p,
                                      buffers)
         watch('features', lines[:count])
         self.unlinked = count
-        alive = link_lines(lines, count, grey.shape, p, buffers)
-        segments = segments_of(lines, alive)
-        watch('linking', segments)
+        if p.refine:
+            watch('linking', None)
+            segments = refine_lines(lines, count, _ridges(grey.shape, keep, noise, p, buffers), p, buffers)
+        else:
+            segments = segments_of(lines, link_lines(lines, count, grey.shape, p, buffers))
+            watch('linking', None)
+        watch('refinement', segments)
         if not view.whole:
             segments = placed(segments, view.x, view.y, view.across, view.down)
         return selected(segments, p)
+
+
+def _ridges(
+    shape: tuple[int, ...], keep: NDArray[np.uint8] | None, noise: float, parameters: Parameters, buffers: Buffers,
+) -> Ridges:
+    """The gradient that edge extraction left, nothing where the mask is, with what is known of its noise."""
+    height, width = shape
+    gx, gy = kept_gradient(buffers)
+    if keep is not None:
+        for part in (gx, gy):
+            part[PAD:PAD + height, PAD:PAD + width][keep == 0] = 0
+    return Ridges(gx, gy, PAD, height, width, noise * gradient_noise(parameters), step_response(parameters),
+                  correlation_length(parameters))
 
 
 def working_picture(
@@ -311,10 +341,10 @@ def _stages(kept: dict[str, Any], segments: NDArray[np.void]) -> Stages:
     return Stages(
         grey=grey, candidates=candidates, strong=(marks & STRONG != 0)[inside],
         edges=np.where(visited[inside] & TAKEN, candidates, 0).astype(np.uint8), chain_pixels=pixels,
-        chain_offsets=chains.offsets, chain_directions=chains.directions, closed=chains.closed,
+        chain_offsets=chains.offsets, chain_directions=chain_directions(chains, marks.shape[1]), closed=chains.closed,
         bridged=chains.bridged, codes_before=chains.codes, codes_after=kept['normalization'],
         blobs=blobs.attributes, blob_pixels=pixels[blobs.members], blob_offsets=blobs.offsets,
-        unlinked=segments_of(lines, np.ones(lines.size, np.bool_)), linked=kept['linking'], segments=segments)
+        unlinked=segments_of(lines, np.ones(lines.size, np.bool_)), linked=kept['refinement'], segments=segments)
 
 
 _of_thread = threading.local()

@@ -25,19 +25,24 @@ class Profile:
 #: The named sets.
 PROFILES = {
     'default': Profile('For any camera: every parameter has its default.'),
-    'paper': Profile('The six steps of the paper and nothing more.'),
+    'paper': Profile('The six steps of the paper and nothing more.', {
+        'alpha': (1.0, 'One width for all pictures; the paper has none that depends on the noise.'),
+        'T1': (8.0, 'A step of 35 grey levels starts an edge.'),
+        'T2': (3.0, 'An edge is followed down to a step of 13 grey levels.'),
+        'noise_T1': (0.0, 'The thresholds are the same for all pictures.'),
+        'noise_T2': (0.0, 'The lower threshold does not depend on the noise either.'),
+        'grouping': ('codes', 'Line-blobs are connected pixels of one code.'),
+        'refine': (False, 'Lines are fitted to their blobs, and linked.'),
+    }),
     'corridor': Profile('For a mobile robot indoors: doors, skirting boards, lamps and notice boards.', {
-        'T1': (5.0, 'Painted walls differ little from each other: a step of 22 grey levels is enough to start a line.'),
-        'T2': (2.0, 'Far down the corridor the edges fade, and lines are followed there to 9 grey levels.'),
-        'n': (2, 'A wider window swallows the short sides of frames and signs, and their corners with them.'),
-        'min_length': (10.0, 'Shorter ones are mostly texture and noise, which low thresholds let through.'),
+        'T1': (5.0, 'A sharp step of 13 grey levels starts a line: weaker ones are mostly plaster and floor.'),
+        'min_length': (12.0, 'Shorter ones are letters, door handles and texture.'),
     }),
     'lane_tracking': Profile('For a car that keeps to its lane: painted marks and kerbs, both borders of each.', {
         'roi': ((0.0, 0.4, 1.0, 0.6), (
             'Lanes are below the horizon: if yours is not at 0.4 of the height, set the second number to where it is '
             'and the fourth to the rest.')),
-        'T1': (5.0, 'A step of 22 grey levels is enough: worn paint on pale concrete or a dim road has hardly more.'),
-        'T2': (2.0, 'Marks fade with the distance and are followed to 9 grey levels.'),
+        'T1': (5.0, 'A sharp step of 13 grey levels starts a line, which worn paint on pale concrete still is.'),
         'theta_min': (0.15, (
             'Within 9 degrees of the horizontal there are stop lines, shadows and cars, and lanes only in a bend far '
             'ahead.')),

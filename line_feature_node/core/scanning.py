@@ -102,7 +102,6 @@ class Chains(NamedTuple):
     Attributes:
         pixels: int32, pixels of all chains one after the other, as flat indices into the marks.
         codes: uint8, gradient direction code of each pixel.
-        directions: uint8, chain code: direction from each pixel to the next; 255 at the end of an open chain.
         bridged: bool, whether the pixel fills a gap.
         offsets: int32, where each chain starts in these; one more than there are chains.
         closed: bool, whether the end of each chain meets its start.
@@ -110,7 +109,6 @@ class Chains(NamedTuple):
 
     pixels: NDArray[np.int32]
     codes: NDArray[np.uint8]
-    directions: NDArray[np.uint8]
     bridged: NDArray[np.bool_]
     offsets: NDArray[np.int32]
     closed: NDArray[np.bool_]
@@ -121,11 +119,12 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
 
     Args:
         marks: As edge extraction leaves them; pixels that were visited become TAKEN.
-        parameters: max_gap and min_chain are used.
+        parameters: max_gap, min_chain and refine are used: what is refined needs no chains over gaps, as its lines grow
+            over them, nor any that are closed, and short ones give no line.
         buffers: Memory to work in.
 
     Returns:
-        The chains of at least min_chain pixels.
+        The chains of at least min_chain pixels; all as they were traced where lines are refined.
     """
     flat = marks.reshape(-1)
     stride = marks.shape[1]
@@ -134,18 +133,29 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
     raw_offsets = buffers.array('raw offsets', most + 1, np.int32)
     raw = trace(flat, flat.view(np.uint64), stride, NEXT_STATE, _state_steps(stride), raw_pixels, raw_codes,
                 raw_offsets, buffers.array('stack', most, np.int32))
+    if parameters.refine:
+        length = raw_offsets[raw]
+        return Chains(raw_pixels[:length], raw_codes[:length],
+                      buffers.array('not bridged', length, np.bool_, zeros=True)[:length], raw_offsets[:raw + 1],
+                      buffers.array('not closed', raw, np.bool_, zeros=True)[:raw])
     links = buffers.array('links', 2 * raw, np.int32)
     link_gaps(flat, stride, raw, parameters.max_gap, FAN, FAN_OFFSETS, raw_pixels, raw_codes, raw_offsets,
               buffers.array('ends', flat.size, np.int32), buffers.array('end directions', 2 * raw, np.uint8), links)
     most += parameters.max_gap * raw
     pixels, codes = buffers.array('pixels', most, np.int32), buffers.array('codes', most, np.uint8)
-    directions, bridged = buffers.array('directions', most, np.uint8), buffers.array('bridged', most, np.bool_)
+    bridged = buffers.array('bridged', most, np.bool_)
     offsets, closed = buffers.array('offsets', raw + 1, np.int32), buffers.array('closed', raw, np.bool_)
     count = assemble(stride, raw, parameters.min_chain, raw_pixels, raw_codes, raw_offsets, links,
-                     buffers.array('done', raw, np.bool_), pixels, codes, directions, bridged, offsets, closed)
+                     buffers.array('done', raw, np.bool_), pixels, codes, bridged, offsets, closed)
     length = offsets[count]
-    return Chains(pixels[:length], codes[:length], directions[:length], bridged[:length], offsets[:count + 1],
-                  closed[:count])
+    return Chains(pixels[:length], codes[:length], bridged[:length], offsets[:count + 1], closed[:count])
+
+
+def chain_directions(chains: Chains, stride: int) -> NDArray[np.uint8]:
+    """The chain code: the direction from each pixel to the next; 255 at the end of an open chain."""
+    directions = np.empty(chains.pixels.size, np.uint8)
+    write_directions(chains.pixels, chains.offsets, chains.closed, stride, directions)
+    return directions
 
 
 @kernel
@@ -363,7 +373,7 @@ def take_gap(marks: Any, pixel: int, target: int, gap: int, stride: int) -> bool
 @kernel
 def assemble(
     stride: int, raw: int, min_chain: int, raw_pixels: Any, raw_codes: Any, raw_offsets: Any, links: Any, done: Any,
-    pixels: Any, codes: Any, directions: Any, bridged: Any, offsets: Any, closed: Any,
+    pixels: Any, codes: Any, bridged: Any, offsets: Any, closed: Any,
 ) -> int:
     """Write out the linked chains with their gaps filled, without the short ones; return their number."""
     for chain in range(raw):
@@ -392,7 +402,6 @@ def assemble(
             length = first
             continue
         closed[chains] = length - first >= 4 and are_neighbours(pixels[length - 1], pixels[first], stride)
-        chain_codes(pixels, first, length, closed[chains], stride, directions)
         chains += 1
         offsets[chains] = length
     return chains
@@ -441,12 +450,14 @@ def bridge(target: int, stride: int, pixels: Any, codes: Any, bridged: Any, leng
     return length
 
 
-@inlined
-def chain_codes(pixels: Any, first: int, end: int, closed: bool, stride: int, directions: Any) -> None:
-    """Write the direction from each pixel of a chain to the next."""
-    for k in range(first, end - 1):
-        directions[k] = chain_code(pixels[k + 1] - pixels[k], np.int32(stride))
-    directions[end - 1] = chain_code(pixels[first] - pixels[end - 1], np.int32(stride)) if closed else END
+@kernel
+def write_directions(pixels: Any, offsets: Any, closed: Any, stride: int, directions: Any) -> None:
+    """Write the direction from each pixel of every chain to the next."""
+    for chain in range(closed.size):
+        first, end = offsets[chain], offsets[chain + 1]
+        for k in range(first, end - 1):
+            directions[k] = chain_code(pixels[k + 1] - pixels[k], np.int32(stride))
+        directions[end - 1] = (chain_code(pixels[first] - pixels[end - 1], np.int32(stride)) if closed[chain] else END)
 
 
 @inlined

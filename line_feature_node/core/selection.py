@@ -108,6 +108,7 @@ def placed(segments: NDArray[np.void], x: float, y: float, across: float, down: 
         slope = np.where(cos >= VERTICAL, sin / cos, np.nan)
     segments['intercept'] = segments['y'] - slope * segments['x']
     segments['rho'] = segments['y'] * cos - segments['x'] * sin
+    segments['sigma_offset'] *= np.sqrt(across * down)
     return segments
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from line_feature_node.core.edges import CODE, STRONG
-from line_feature_node.core.scanning import END, TAKEN, Chains
+from line_feature_node.core.scanning import TAKEN, Chains
 
 #: The two structuring elements of Golay's L, each turned three times by a right angle: 1 is edge, -1 background.
 GOLAY = [np.rot90(element, turn) for element in (
@@ -47,8 +47,7 @@ def unscanned(marks: NDArray[np.uint8]) -> Chains:
     flat = marks.reshape(-1)
     codes = flat[pixels] & np.uint8(CODE)
     flat[pixels] = TAKEN
-    return Chains(pixels, codes, np.full(pixels.size, END, np.uint8), np.zeros(pixels.size, np.bool_),
-                  np.zeros(1, np.int32), np.zeros(0, np.bool_))
+    return Chains(pixels, codes, np.zeros(pixels.size, np.bool_), np.zeros(1, np.int32), np.zeros(0, np.bool_))
 
 
 def connected(marks: NDArray[np.uint8]) -> NDArray[np.uint8]:
