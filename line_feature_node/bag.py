@@ -22,6 +22,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import yaml
 from rosbags.interfaces import (
     Connection,
     MessageDefinitionFormat,
@@ -38,6 +39,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from line_feature_node.core import SEGMENT_DTYPE
 from line_feature_node.frames import Frames
 from line_feature_node.recordings import (
+    METADATA,
     RecordingError,
     Salvage,
     Slice,
@@ -60,6 +62,10 @@ VERSION: Literal[9] = 9
 NO_IMAGES = 'no images to be processed'
 #: What definitions that are wrong or missing raise: the parser, the table of types, and their use.
 UNKNOWN_TYPES = (AssertionError, KeyError, TypesysError, ValueError)
+#: Name of the segments as a table in a bag.
+TABLE = 'segments.csv'
+#: Files of messages in a bag, by their ending.
+OF_BAGS = ('.db3', '.mcap')
 #: How a rename says that something is there, be it a folder with something in it or a file.
 TAKEN = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
@@ -160,8 +166,7 @@ def process_recording(
         raise TargetError(f'{target} is the recording itself, or one of the two is in the other')
     if there in (Path.cwd(), *Path.cwd().parents):
         raise TargetError(f'{target} is the folder that this is started in, or above it: name a new one')
-    if there.exists() and not run.overwrite:
-        raise TargetError(f'{target} exists: --overwrite replaces it')
+    _check(target, there, overwrite=run.overwrite)
     reading = reading or source
     slices = [replace(part, path=reading.absolute())  # workers may be in other folders
               for part in plan(reading, topics=list(run.topics), start=run.start, end=run.end, every=run.every)]
@@ -181,9 +186,57 @@ def process_recording(
 
 
 def partial_folder(target: Path) -> Path:
-    """The folder for what is under way, beside the target."""
+    """The folder for what is under way, beside the target.
+
+    Raises:
+        TargetError: Nothing can be beside it.
+    """
     there = Path(os.path.realpath(target))
+    if not there.name:
+        raise TargetError(f'{target} is the root of the file system: name a new folder in it')
     return there.with_name(f'{there.name}.partial')
+
+
+def _check(target: Path, there: Path, *, overwrite: bool) -> None:
+    """See that nothing is lost where a target is to be: only bags, and folders with nothing in them, are replaced.
+
+    Args:
+        target: As its user calls it.
+        there: The place that it leads to.
+        overwrite: Whether they are replaced.
+
+    Raises:
+        TargetError: There is something that stays.
+    """
+    with _told(target):
+        if not os.path.lexists(there):
+            return
+        other = _not_of_a_bag(there)
+    if other:
+        raise TargetError(f'{target} exists and is not replaced, as it is no bag: {other}')
+    if not overwrite:
+        raise TargetError(f'{target} exists: --overwrite replaces it')
+
+
+def _not_of_a_bag(path: Path) -> str:
+    """Why what is there is more or other than a bag or an empty folder; '' where it is not."""
+    if not path.is_dir():
+        return 'it is no folder'
+    entries = sorted(path.iterdir())
+    for entry in entries:
+        if entry.is_dir() or not (entry.name in (METADATA, TABLE) or entry.suffix in OF_BAGS):
+            return f'{entry.name} is in it'
+    if entries and not _describes_a_bag(path / METADATA):
+        return f'it has no {METADATA} of one'
+    return ''
+
+
+def _describes_a_bag(metadata: Path) -> bool:
+    try:
+        content = yaml.safe_load(metadata.read_text(encoding='utf-8'))
+    except (OSError, RecursionError, ValueError, yaml.YAMLError):
+        return False
+    return isinstance(content, dict) and 'rosbag2_bagfile_information' in content
 
 
 @contextlib.contextmanager
@@ -244,8 +297,7 @@ class _Work:
         described = json.dumps(self._description(), default=str, sort_keys=True)
         record = self._folder / 'run.json'
         self._settle()
-        if self._target.exists() and not self._run.overwrite:
-            raise TargetError(f'{self._target} exists: --overwrite replaces it')
+        _check(self._target, self._target, overwrite=self._run.overwrite)
         if self._run.resume and record.exists() and record.read_text() != described:
             raise TargetError(f'{self._folder} is of a run with other settings, another recording or another version: '
                               f'remove it, or run without --resume')
@@ -269,7 +321,7 @@ class _Work:
             self.uncopied, self.spoilt = self._copier.left_out, self._copier.spoilt
         self._csv = None
         if self._run.job.csv:
-            self._csv = self._stack.enter_context((self._folder / 'segments.csv').open('w', newline=''))
+            self._csv = self._stack.enter_context((self._folder / TABLE).open('w', newline=''))
             self._csv.write(','.join(('stamp', 'topic', 'frame', *(SEGMENT_DTYPE.names or ()))) + '\n')
 
     def _description(self) -> dict[str, Any]:
@@ -356,16 +408,17 @@ class _Work:
         self._writer = None
         self._stack.close()
         if self._csv is not None:
-            (self._folder / 'segments.csv').rename(self._bag / 'segments.csv')
+            (self._folder / TABLE).rename(self._bag / TABLE)
         for file in self._bag.iterdir():
             _sync(file)
         self._put_in_place()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _put_in_place(self) -> None:
-        came_up = (f'{self._target} came up during the run and stays as it is: --resume with --overwrite replaces it '
-                   f'without doing the work again')
+        came_up = (f'{self._target} came up during the run and stays as it is: once it is away, --resume puts the new '
+                   f'bag there without doing the work again')
         if self._run.overwrite:
+            _check(self._target, self._target, overwrite=True)  # something else may have come up during the run
             with contextlib.suppress(FileNotFoundError):
                 self._target.rename(self._replaced)
         elif self._target.exists():
@@ -383,10 +436,8 @@ class _Work:
             return
         if not self._target.exists():
             self._replaced.rename(self._target)
-        elif self._replaced.is_dir():
-            shutil.rmtree(self._replaced)
         else:
-            self._replaced.unlink()
+            shutil.rmtree(self._replaced)
 
     def __exit__(self, *_: object) -> None:
         self._clear_up()

@@ -42,7 +42,7 @@ def bag(
     parameters: Parameters,
     profile: str,
     options: Options,
-    out: Annotated[Path, typer.Option(help='The new bag; of several recordings, the folder for theirs.')],
+    out: Annotated[Path, typer.Option(help='The new bag; of several recordings, or a folder of them, their folder.')],
     topic: Annotated[Optional[list[str]], typer.Option(help='Topic of images; all of them unless given.')] = None,
     start: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to start at.')] = None,
     end: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to end at.')] = None,
@@ -58,7 +58,7 @@ def bag(
     scheduler: Annotated[Optional[str], typer.Option(help='Dask scheduler instead, tcp://host:port.')] = None,
     salvage: Annotated[bool, typer.Option('--salvage', help='Process what precedes a cut or damage.')] = False,
     resume: Annotated[bool, typer.Option('--resume', help='Go on from what an interrupted run left.')] = False,
-    overwrite: Annotated[bool, typer.Option('--overwrite', help='Replace what is there.')] = False,
+    overwrite: Annotated[bool, typer.Option('--overwrite', help='Replace a bag that is there.')] = False,
     quiet: Annotated[bool, typer.Option('--quiet', help='Only errors are printed.')] = False,
     as_json: Annotated[bool, typer.Option('--json', help='Print one line of JSON at the end.')] = False,
 ) -> None:
@@ -74,7 +74,7 @@ def bag(
         masks = [*([mask_file] if mask_file else []), *([Path(options.mask_file)] if options.mask_file else [])]
         mask = read_mask(masks[0]) if masks else None
         sources = find_recordings(recordings)
-        pairs = list(_targets(sources, out))
+        pairs = list(_targets(recordings, sources, out))
         job = Job(parameters, mask, outputs=('segments',) if only_segments else tuple(OUTPUTS), truth=truth, csv=csv,
                   jpeg_quality=options.jpeg_quality)
         run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)
@@ -108,9 +108,12 @@ def bag(
     raise typer.Exit(status)
 
 
-def _targets(sources: list[Path], out: Path) -> Iterator[tuple[Path, Path]]:
-    """Each recording with its bag; names that come twice are numbered."""
-    if len(sources) == 1:
+def _targets(recordings: list[Path], sources: list[Path], out: Path) -> Iterator[tuple[Path, Path]]:
+    """Each recording with its bag: one that was named itself, and no other, has `out`; all others are in that folder.
+
+    Names that come twice are numbered.
+    """
+    if sources == recordings and len(sources) == 1:
         yield sources[0], out
         return
     names = unique_names(source.name if source.is_dir() else source.stem for source in sources)

@@ -634,51 +634,118 @@ def test_the_truth_is_compared_with(tmp_path):
 
 # Targets
 
-def test_a_target_that_exists_is_refused_before_anything_is_done(source, tmp_path, counted):
-    for make in (lambda path: path.mkdir(), lambda path: path.write_text('mine')):
-        target = tmp_path / 'out'
-        make(target)
-        with pytest.raises(TargetError, match='--overwrite') as error:
-            process(source, target)
-        assert str(target) in one_sentence(error)
-        assert [path.name for path in tmp_path.iterdir()] == ['out']
-        target.rmdir() if target.is_dir() else target.unlink()
+def old_bag(path):
+    """What an earlier run made there."""
+    path.mkdir(parents=True)
+    (path / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
+    for name in ('old.mcap', 'old.db3', 'segments.csv'):
+        (path / name).touch()
+
+
+def is_old(path):
+    return {entry.name for entry in path.iterdir()} == {'metadata.yaml', 'old.mcap', 'old.db3', 'segments.csv'}
+
+
+@pytest.mark.parametrize('make', [Path.mkdir, old_bag])
+def test_a_target_that_exists_is_refused_before_anything_is_done(source, tmp_path, counted, make):
+    target = tmp_path / 'out'
+    make(target)
+    before = sorted(tmp_path.rglob('*'))
+    with pytest.raises(TargetError, match='--overwrite') as error:
+        process(source, target)
+    assert str(target) in one_sentence(error)
+    assert sorted(tmp_path.rglob('*')) == before
     assert counted == []
 
 
-@pytest.mark.parametrize('kind', ['folder', 'file'])
-def test_overwriting_replaces_the_whole_target(source, result, tmp_path, kind):
+@pytest.mark.parametrize('make', [Path.mkdir, old_bag])
+def test_overwriting_replaces_the_whole_target(source, result, tmp_path, make):
     target = tmp_path / 'out'
-    if kind == 'folder':
-        target.mkdir()
-        (target / 'old.txt').write_text('old')
-    else:
-        target.write_text('old')
+    make(target)
     process(source, target, overwrite=True)
     assert read(target) == read(result)
     assert {path.name for path in target.iterdir()} == {'metadata.yaml', 'out.mcap'}
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 
 
+def with_thesis(path):
+    old_bag(path)
+    (path / 'thesis.txt').write_text('of somebody')
+
+
+def with_folder(path):
+    old_bag(path)
+    (path / 'more.mcap').mkdir()
+
+
+def without_metadata(path):
+    old_bag(path)
+    (path / 'metadata.yaml').unlink()
+
+
+def with_other_metadata(path):
+    old_bag(path)
+    (path / 'metadata.yaml').write_text('title: photographs')
+
+
+def with_metadata_that_is_noise(path):
+    old_bag(path)
+    (path / 'metadata.yaml').write_bytes(b'\xff{')
+
+
+@pytest.mark.parametrize(('make', 'reason'), [
+    (with_thesis, 'thesis.txt is in it'), (with_folder, 'more.mcap is in it'),
+    (without_metadata, 'it has no metadata.yaml of one'), (with_other_metadata, 'it has no metadata.yaml of one'),
+    (with_metadata_that_is_noise, 'it has no metadata.yaml of one'), (Path.touch, 'it is no folder')])
+@pytest.mark.parametrize('overwrite', [False, True])
+def test_what_is_no_bag_is_never_replaced(source, tmp_path, counted, make, reason, overwrite):
+    make(tmp_path / 'out')
+    before = sorted(tmp_path.rglob('*'))
+    with pytest.raises(TargetError) as error:
+        process(source, tmp_path / 'out', overwrite=overwrite)
+    assert one_sentence(error) == f'{tmp_path}/out exists and is not replaced, as it is no bag: {reason}'
+    assert sorted(tmp_path.rglob('*')) == before
+    assert counted == []
+
+
+def test_what_is_put_into_the_old_one_during_the_run_is_not_lost(source, result, tmp_path, counted):
+    target = tmp_path / 'out'
+    old_bag(target)
+    with pytest.raises(TargetError, match='thesis.txt is in it'):
+        process(source, target, overwrite=True, watch=lambda *_: (target / 'thesis.txt').touch())
+    (target / 'thesis.txt').unlink()
+    assert is_old(target)
+    counted.clear()
+    process(source, target, overwrite=True, resume=True)
+    assert counted == []
+    assert read(target) == read(result)
+
+
+@pytest.mark.parametrize('root', ['/', '//', '/..'])
+def test_the_root_of_the_file_system_is_no_target(source, root):
+    for work in (lambda: process(source, Path(root), overwrite=True), lambda: bag.partial_folder(Path(root))):
+        with pytest.raises(TargetError) as error:
+            work()
+        one_sentence(error)
+
+
 def test_the_old_one_stays_while_the_run_goes_on_and_when_it_fails(source, tmp_path):
     target = tmp_path / 'out'
-    target.mkdir()
-    (target / 'old.txt').write_text('old')
+    old_bag(target)
     with pytest.raises(Stop):
         process(source, target, watch=stopper(2), overwrite=True)
-    assert [path.name for path in target.iterdir()] == ['old.txt']
+    assert is_old(target)
     (tmp_path / 'bad.mcap').write_bytes(b'noise')
     with pytest.raises(RecordingError):
         process(tmp_path / 'bad.mcap', target, overwrite=True)
-    assert [path.name for path in target.iterdir()] == ['old.txt']
+    assert is_old(target)
     assert process(source, target, start=1e6, overwrite=True).error == bag.NO_IMAGES
-    assert [path.name for path in target.iterdir()] == ['old.txt']
+    assert is_old(target)
 
 
 def test_the_old_one_stays_when_the_new_one_cannot_be_put_in_its_place(source, tmp_path, monkeypatch):
     target = tmp_path / 'out'
-    target.mkdir()
-    (target / 'old.txt').write_text('old')
+    old_bag(target)
     rename = Path.rename
 
     def failing(self, other):
@@ -689,47 +756,38 @@ def test_the_old_one_stays_when_the_new_one_cannot_be_put_in_its_place(source, t
     monkeypatch.setattr(Path, 'rename', failing)
     with pytest.raises(TargetError, match='Input/output error'):
         process(source, target, overwrite=True)
-    assert [path.name for path in target.iterdir()] == ['old.txt']
+    assert is_old(target)
 
 
 @pytest.mark.parametrize('resume', [False, True])
 def test_a_run_that_was_killed_when_it_had_replaced_the_old_one_is_in_nobodys_way(source, tmp_path, resume):
     target = tmp_path / 'out'
     for path in (target, tmp_path / 'out.partial' / 'replaced'):
-        path.mkdir(parents=True)
-        (path / 'old.txt').write_text('old')
+        old_bag(path)
     process(source, target, overwrite=True, resume=resume)
     assert (target / 'metadata.yaml').exists()
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 
 
-@pytest.mark.parametrize('kind', ['folder', 'file'])
-def test_what_a_run_took_away_and_did_not_replace_is_put_back_and_kept_unless_it_may_be_replaced(
-        source, tmp_path, kind):
-    target, taken = tmp_path / 'out', tmp_path / 'out.partial' / 'replaced'
-    taken.parent.mkdir()
-    if kind == 'folder':
-        taken.mkdir()
-        (taken / 'old.txt').write_text('old')
-    else:
-        taken.write_text('old')
+def test_what_a_run_took_away_and_did_not_replace_is_put_back_and_kept_unless_it_may_be_replaced(source, tmp_path):
+    target = tmp_path / 'out'
+    old_bag(tmp_path / 'out.partial' / 'replaced')
     with pytest.raises(TargetError, match='out exists: --overwrite'):
         process(source, target)
-    assert (target / 'old.txt' if kind == 'folder' else target).read_text() == 'old'
+    assert is_old(target)
     process(source, target, overwrite=True)
-    assert (target / 'metadata.yaml').exists()
+    assert not is_old(target)
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 
 
 def test_a_run_that_is_killed_between_the_two_renames_costs_nothing(source, result, tmp_path):
     target = tmp_path / 'out'
-    target.mkdir()
-    (target / 'old.txt').write_text('old')
+    old_bag(target)
     run_and_die(tmp_path, source, 'pass', 'Path.rename = die_before_the_second')
     assert [path.name for path in tmp_path.iterdir()] == ['out.partial']
     with pytest.raises(Stop):
         process(source, target, overwrite=True, resume=True, watch=stopper(1))
-    assert [path.name for path in target.iterdir()] == ['old.txt']
+    assert is_old(target)
     process(source, target, overwrite=True, resume=True)
     assert read(target) == read(result)
 
@@ -747,7 +805,8 @@ def test_a_target_that_comes_up_during_the_run_is_not_replaced(source, result, t
     one_sentence(error)
     assert [path.name for path in target.iterdir()] == ['mine.txt']
     counted.clear()
-    process(source, target, overwrite=True, resume=True)
+    shutil.rmtree(target)
+    process(source, target, resume=True)
     assert counted == []
     assert read(target) == read(result)
 
@@ -771,8 +830,7 @@ def test_a_target_that_comes_up_in_the_moment_of_the_rename_is_not_replaced(
 
 def test_an_interrupt_right_after_the_old_one_was_taken_away_puts_it_back(source, tmp_path, monkeypatch):
     target = tmp_path / 'out'
-    target.mkdir()
-    (target / 'old.txt').write_text('old')
+    old_bag(target)
     rename = Path.rename
 
     def interrupted(self, other):
@@ -783,7 +841,7 @@ def test_an_interrupt_right_after_the_old_one_was_taken_away_puts_it_back(source
     monkeypatch.setattr(Path, 'rename', interrupted)
     with pytest.raises(Stop):
         process(source, target, overwrite=True)
-    assert [path.name for path in target.iterdir()] == ['old.txt']
+    assert is_old(target)
 
 
 def test_a_link_is_followed_to_where_the_result_is_to_be(source, result, tmp_path):
@@ -1000,7 +1058,7 @@ def run_and_die(folder, source, line, before='pass'):
         'from line_feature_node.slices import Job\nfrom line_feature_node.workers import local\n'
         'def die():\n    os.kill(os.getpid(), signal.SIGKILL)\n'
         'def die_before_the_second(self, other, rename=Path.rename):\n'
-        '    if (self / "metadata.yaml").exists(): die()\n    rename(self, other)\n'
+        '    if self.parent.name == "bag": die()\n    rename(self, other)\n'
         f'def watch(done, slices, frame):\n    {line}\n'
         f'if __name__ == "__main__":\n    {before}\n'
         f'    process_recording(Path({str(source)!r}), Path({str(folder / "out")!r}), '
@@ -1020,10 +1078,9 @@ def test_a_run_that_is_killed_leaves_no_target_and_can_be_gone_on_with(source, r
 
 
 def test_a_run_that_is_killed_leaves_the_old_target(source, tmp_path):
-    (tmp_path / 'out').mkdir()
-    (tmp_path / 'out' / 'old.txt').write_text('old')
+    old_bag(tmp_path / 'out')
     run_and_die(tmp_path, source, 'if frame is None and done == slices: die()')
-    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['old.txt']
+    assert is_old(tmp_path / 'out')
 
 
 def test_two_runs_at_once_are_refused_by_the_lock(source, result, tmp_path):
@@ -1204,13 +1261,12 @@ def test_segments_agree_with_the_truth(tmp_path):
 
 def test_a_target_that_exists_is_refused_or_replaced_as_a_whole(tmp_path):
     target = tmp_path / 'out'
-    target.mkdir()
-    (target / 'old').touch()
+    old_bag(target)
     with pytest.raises(TargetError, match='--overwrite'):
         sample(target)
-    assert (target / 'old').exists()
+    assert is_old(target)
     sample(target, overwrite=True)
-    assert not (target / 'old').exists()
+    assert not is_old(target)
     assert len(read(target)) == 40
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 

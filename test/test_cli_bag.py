@@ -274,14 +274,28 @@ def test_status_2_when_nothing_is_there(tmp_path):
 
 
 def test_a_target_that_exists_is_refused_and_replaced_on_request(recording, tmp_path):
-    (tmp_path / 'out').mkdir()
-    (tmp_path / 'out' / 'old.txt').touch()
+    write(tmp_path / 'out', film(2))
     result = run(recording, '--out', tmp_path / 'out')
     assert result.exit_code == 2
     assert f'{tmp_path}/out exists: --overwrite replaces it' in one_line(result)
-    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['old.txt']
+    assert count_of(tmp_path / 'out') == {'/camera': 2}
     assert run(recording, '--out', tmp_path / 'out', '--overwrite').exit_code == 0
     assert count_of(tmp_path / 'out')['/camera/segments'] == 10
+
+
+@pytest.mark.parametrize('salvage', [(), ('--salvage',)])
+def test_the_root_of_the_file_system_is_no_target(recording, salvage):
+    result = run(recording, '--out', '/', '--overwrite', *salvage)
+    assert result.exit_code == 2
+    assert one_line(result) == f'{recording}: / is the root of the file system: name a new folder in it'
+
+
+def test_a_folder_of_one_recording_makes_a_folder_of_one_bag(tmp_path):
+    write(tmp_path / 'in' / 'rec', film(2))
+    result = run(tmp_path / 'in', '--out', tmp_path / 'out', '--only-segments')
+    assert result.exit_code == 0, result.output
+    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['rec']
+    assert count_of(tmp_path / 'out' / 'rec') == {'/camera/segments': 2}
 
 
 def test_a_place_that_cannot_be_written_to_is_a_sentence(recording, tmp_path):
