@@ -184,6 +184,12 @@ def _extractor(parameters: Parameters) -> LineFeatureExtractor:
     return LineFeatureExtractor(parameters)
 
 
+@cache
+def _warm_up(parameters: Parameters, kind: np.dtype[Any]) -> None:
+    """Load the kernels for a type of pixels, once a worker: that is no part of what a frame takes."""
+    _extractor(parameters).warm_up(kind)
+
+
 def _compare(reader: Reader, part: Slice, frames: list[Frame], found: list[NDArray[np.void] | None]) -> None:
     """Fill in how the segments of frames agree with the true ones of the same topic and stamp."""
     wanted = {f'{topic}/{TRUTH}' for topic in part.topics}
@@ -207,8 +213,10 @@ def _process(
         message = deserialize(path, data, msgtype)
         frame.header_stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         image = DECODERS[msgtype](message)
+        usable = usable_pixels(image, job.mask)
+        _warm_up(job.parameters, image.dtype)
         begin = time.perf_counter()
-        segments = extractor.extract(image, usable_pixels(image, job.mask))
+        segments = extractor.extract(image, usable)
         frame.seconds = time.perf_counter() - begin
     except (cv2.error, MemoryError, TypeError, ValueError) as error:
         frame.error = ' '.join(str(error).split()) or type(error).__name__

@@ -415,6 +415,25 @@ BURSTS = {
 }
 
 
+def test_kernels_are_loaded_before_the_first_frame_of_a_type_and_parameters_is_timed(tmp_path, monkeypatch):
+    calls = []
+    warm_up = LineFeatureExtractor.warm_up
+
+    def called(extractor, *types):
+        calls.append((extractor.parameters, types))
+        warm_up(extractor, *types)
+
+    monkeypatch.setattr(LineFeatureExtractor, 'warm_up', called)
+    deep = image((picture().astype(np.uint16) << 8), encoding='16UC1')
+    path = write(tmp_path / 'rec', [*film(3), ('/camera', IMAGE, stamp_of(3), deep), *film(9)[4:]])
+    [part] = plan(path, topics=[])
+    first, second = (Parameters(min_length=length) for length in (12.125, 12.25))  # no other test has these
+    for parameters in (first, first, second):
+        frames = unpack(process_slice(part, Job(parameters, outputs=('segments',))))
+        assert [frame.error for frame in frames] == 9 * ['']
+    assert calls == [(parameters, (np.dtype(kind),)) for parameters in (first, second) for kind in ('uint8', 'uint16')]
+
+
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('burst', BURSTS)
 def test_frames_that_come_in_a_burst_are_done_piece_by_piece(tmp_path, burst, storage):
