@@ -142,7 +142,7 @@ class Outcome:
 
 def process_recording(
     source: Path, target: Path, run: Run, workers: Workers, watch: Callable[[int, int, Frame | None], None],
-    reading: Path | None = None,
+    reading: Path | None = None, say: Callable[[str], None] = lambda _: None,
 ) -> Outcome:
     """Process one recording into a bag.
 
@@ -154,6 +154,7 @@ def process_recording(
         watch: Told of each frame that is done, with the number of slices that are done, and of all that are known of,
             which grows where frames come in bursts; None for no frame.
         reading: What is read in place of the recording.
+        say: Told, in a sentence, of slices that were done and are discarded, as the run does not resume.
 
     Raises:
         RecordingError: The recording cannot be read.
@@ -174,7 +175,7 @@ def process_recording(
     if not slices:
         outcome.error = NO_IMAGES
         return outcome
-    with (_told(target), _Work(reading, there, run, slices) as work,
+    with (_told(target), _Work(reading, there, run, slices, say) as work,
           contextlib.closing(work.results(workers)) as results):
         for done, (part, data) in enumerate(results, 1):
             for frame in work.write(part, unpack(data), outcome):
@@ -257,10 +258,13 @@ def _told(target: Path) -> Iterator[None]:
 class _Work:
     """The folder for what is under way, and the bag in it that is being written."""
 
-    def __init__(self, source: Path, target: Path, run: Run, slices: list[Slice]) -> None:
+    def __init__(
+        self, source: Path, target: Path, run: Run, slices: list[Slice], say: Callable[[str], None],
+    ) -> None:
         self._target = target
         self._run = run
         self._slices = slices
+        self._say = say
         self._folder = partial_folder(target)
         self._journal = self._folder / 'slices'
         self._replaced = self._folder / 'replaced'
@@ -298,9 +302,13 @@ class _Work:
         record = self._folder / 'run.json'
         self._settle()
         _check(self._target, self._target, overwrite=self._run.overwrite)
-        if self._run.resume and record.exists() and record.read_text() != described:
+        same = record.exists() and record.read_text() == described
+        if self._run.resume and record.exists() and not same:
             raise TargetError(f'{self._folder} is of a run with other settings, another recording or another version: '
                               f'remove it, or run without --resume')
+        done = sum(made for _, _, made in self._pieces()) if same and not self._run.resume else 0
+        if done:  # those of another run would be of no use
+            self._say(f'{done} slices that an interrupted run had done are discarded; --resume would have used them')
         for old in (self._bag.parent, *(() if self._run.resume else (self._journal,))):
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(old)

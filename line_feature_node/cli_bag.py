@@ -21,7 +21,7 @@ from line_feature_node.files import read_mask, unique_names
 from line_feature_node.options import Options
 from line_feature_node.recordings import DamagedError, RecordingError, find_recordings
 from line_feature_node.report import check_report, write_report
-from line_feature_node.slices import OUTPUTS, Frame, Job
+from line_feature_node.slices import OUTPUTS, TRUTH, Frame, Job
 from line_feature_node.workers import Workers, WorkersError, cluster, local
 
 #: Status of a process that SIGINT or SIGTERM ended, as shells have it.
@@ -134,6 +134,9 @@ def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool
         errors.print(f'{source}: {outcome.salvaged}', markup=False)
     for reason, count in outcome.failed.most_common():
         errors.print(f'{source}: {count} frames failed: {reason}', markup=False)
+    if run.job.truth and len(outcome.frames.good) and not outcome.frames.table['compared'].any():
+        places = ', '.join(f'{topic}/{TRUTH}' for topic in sorted({frame.topic for frame in outcome.frames}))
+        errors.print(f'{source}: no frame had a truth on {places}', markup=False)
     if outcome.uncopied:
         errors.print(f'{source}: not copied, for want of their types: {", ".join(outcome.uncopied)}', markup=False)
     for reason, count in outcome.spoilt.most_common():
@@ -143,18 +146,21 @@ def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool
 
 def _read(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool, salvage: bool) -> Outcome:
     """Process a recording as it is or, if that cannot be and is asked for, what can be salvaged of it."""
+    def say(sentence: str) -> None:
+        errors.print(f'{source}: {sentence}', markup=False)
+
     try:
         from line_feature_node.salvage import may_help, salvaged, was_salvaged
     except ImportError:
         if salvage:
             fail('--salvage needs the Python packages lz4, mcap and zstandard: pip install lz4 mcap zstandard')
         with _progress(source.name, quiet=quiet) as watch:
-            return process_recording(source, target, run, crew, watch)
+            return process_recording(source, target, run, crew, watch, say=say)
     place = partial_folder(target)
     if not (salvage and run.resume and was_salvaged(place)):
         try:
             with _progress(source.name, quiet=quiet) as watch:
-                return process_recording(source, target, run, crew, watch)
+                return process_recording(source, target, run, crew, watch, say=say)
         except DamagedError as error:
             if not may_help(source):
                 raise
@@ -162,7 +168,7 @@ def _read(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool, s
                 raise RecordingError(f'{error}: --salvage processes what can still be read') from error
     with salvaged(source, place) as found, _progress(source.name, quiet=quiet) as watch:
         try:
-            outcome = process_recording(source, target, run, crew, watch, reading=found.path)
+            outcome = process_recording(source, target, run, crew, watch, found.path, say)
         except RecordingError as error:
             raise RecordingError(str(error).replace(str(found.path), str(source))) from error
     outcome.salvaged = found

@@ -957,13 +957,29 @@ def test_resuming_again_and_again_comes_to_an_end(source, result, tmp_path, coun
     assert len(counted) < 4 + 2 * 3
 
 
-def test_without_resume_all_is_done_again(source, result, tmp_path, counted):
+def said(source, target, **options):
+    """What a run says of what it finds."""
+    sentences = []
+    process_recording(source, target, Run(JOB, **options), inline(), lambda *_: None, say=sentences.append)
+    return sentences
+
+
+def test_without_resume_all_is_done_again_and_it_is_said(source, result, tmp_path, counted):
     with pytest.raises(Stop):
         process(source, tmp_path / 'out', watch=stopper(2))
+    done = len(list((tmp_path / 'out.partial' / 'slices').iterdir()))
     counted.clear()
-    process(source, tmp_path / 'out')
+    assert said(source, tmp_path / 'out') == [
+        f'{done} slices that an interrupted run had done are discarded; --resume would have used them']
     assert len(counted) == 4
     assert read(tmp_path / 'out') == read(result)
+
+
+@pytest.mark.parametrize('options', [{'resume': True}, {'every': 2}])
+def test_nothing_is_said_to_be_discarded_where_it_is_used_or_could_not_be(source, tmp_path, options):
+    with pytest.raises(Stop):
+        process(source, tmp_path / 'out', watch=stopper(2))
+    assert said(source, tmp_path / 'out', **options) == []
 
 
 def test_resuming_what_was_never_begun_is_a_run(source, result, tmp_path):

@@ -196,6 +196,18 @@ def test_all_options_reach_the_run(tmp_path):
     assert count_of(tmp_path / 'out') == {'/left': 10, '/right': 10, '/words': 0, '/left/segments': 5}
 
 
+def test_a_truth_that_is_missing_is_said(tmp_path):
+    path = write(tmp_path / 'rec', film(3))
+    result = run(path, '--out', tmp_path / 'out', '--truth', '--only-segments', '--json')
+    assert result.exit_code == 0
+    assert result.stderr == f'{path}: no frame had a truth on /camera/truth\n'
+
+
+def test_of_frames_that_all_fail_no_truth_is_missed(tmp_path):
+    path = write(tmp_path / 'rec', [(*entry[:3], image(picture(), encoding='mono12')) for entry in film(3)])
+    assert 'truth' not in run(path, '--out', tmp_path / 'out', '--truth').stderr
+
+
 def test_two_topics_are_named_one_by_one(tmp_path):
     path = write(tmp_path / 'rec', [*film(3, '/a'), *film(3, '/b'), *film(3, '/c')])
     assert run(path, '--out', tmp_path / 'out', '--topic', '/a', '--topic', '/c', '--only-segments').exit_code == 0
@@ -527,8 +539,12 @@ def test_signals_in_the_midst_end_cleanly_and_the_run_can_be_gone_on_with(long, 
     assert [path.name for path in tmp_path.iterdir()] == ['out.partial']
     assert children
     until(lambda: not any(map(alive, children)), 'end of the workers', 5)
-    done = len(list((tmp_path / 'out.partial' / 'slices').iterdir()))
+    done = sum(not path.name.endswith('.new') for path in (tmp_path / 'out.partial' / 'slices').iterdir())
     assert 3 <= done < 94
+    shutil.copytree(tmp_path / 'out.partial', tmp_path / 'again.partial')
+    again = run(long, '--out', tmp_path / 'again', '--only-segments', '--quiet', '--workers', 1)
+    assert one_line(again) == (
+        f'{long}: {done} slices that an interrupted run had done are discarded; --resume would have used them')
     assert run(long, '--out', tmp_path / 'out', '--only-segments', '--resume', '--quiet', '--workers', 1).exit_code == 0
     assert count_of(tmp_path / 'out') == {'/camera/segments': 3000}
 
