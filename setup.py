@@ -53,6 +53,6 @@ setup(
         ],
     },
     entry_points={'console_scripts': [
-        'line_feature_node = line_feature_node.__main__:main', 'line_features = line_feature_node.cli:main',
+        'line_feature_node = line_feature_node.__main__:main', 'line_features = line_feature_node.command:main',
     ]},
 )

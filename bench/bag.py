@@ -44,7 +44,7 @@ PICTURES = 24
 LONG = 10
 #: Nanoseconds: when the recordings begin, and from frame to frame.
 BEGIN, PERIOD = 1_800_000_000 * 10**9, 33_333_333
-PROGRAM = 'from line_feature_node.cli import main; main()'
+PROGRAM = 'from line_feature_node.command import main; main()'
 #: Seconds between two looks at the memory.
 LOOK = 0.02
 

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from line_feature_node import files, scenes, section3, truth
 from line_feature_node.cli_bag import bag
-from line_feature_node.cli_options import console, errors, fail, with_parameters
+from line_feature_node.cli_options import console, errors, fail, path_of, with_parameters
 from line_feature_node.core import STEPS, Parameters, end_points
 from line_feature_node.figures import sheet
 from line_feature_node.images import decode, displayable
@@ -21,7 +21,7 @@ from line_feature_node.overlay import SECTIONS
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-Out = Annotated[Path, typer.Option(help='Folder for the overlays and tables.')]
+Out = Annotated[Path, typer.Option(metavar='PATH', parser=path_of, help='Folder for the overlays and tables.')]
 
 
 def _print_version(wanted: bool) -> None:
@@ -42,7 +42,7 @@ def _options(
 @with_parameters
 def image(
     paths: Annotated[list[Path], typer.Argument(
-        metavar='PATH', readable=False, help='Image files, or folders of them.')],
+        metavar='PATH', parser=path_of, help='Image files, or folders of them.')],
     parameters: Parameters,
     out: Out = Path('line_features'),
     stages: Annotated[bool, typer.Option('--stages', help='Write a picture of what each step made, too.')] = False,
@@ -238,8 +238,3 @@ def _table_of_segments(segments: Any) -> Table:
 
 
 app.command('bag')(with_parameters(bag))
-
-
-def main() -> None:
-    """Run the command."""
-    app()

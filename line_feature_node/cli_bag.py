@@ -15,7 +15,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from line_feature_node.bag import NO_IMAGES, Outcome, Run, TargetError, partial_folder, process_recording
-from line_feature_node.cli_options import console, errors, fail
+from line_feature_node.cli_options import console, errors, fail, path_of
+from line_feature_node.command import INTERRUPTED
 from line_feature_node.core import Parameters
 from line_feature_node.files import read_mask, unique_names
 from line_feature_node.options import Options
@@ -25,7 +26,7 @@ from line_feature_node.slices import OUTPUTS, TRUTH, Frame, Job
 from line_feature_node.workers import Workers, WorkersError, cluster, local
 
 #: Status of a process that SIGINT or SIGTERM ended, as shells have it.
-INTERRUPTED = {signal.SIGINT: 130, signal.SIGTERM: 143}
+STATUS = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: 143}
 
 
 class _Interrupted(BaseException):
@@ -38,11 +39,12 @@ class _Interrupted(BaseException):
 
 def bag(
     recordings: Annotated[list[Path], typer.Argument(
-        metavar='IN', readable=False, help='Recordings (.bag, .mcap, .db3, folders of ROS 2), or folders of them.')],
+        metavar='IN', parser=path_of, help='Recordings (.bag, .mcap, .db3, folders of ROS 2), or folders of them.')],
     parameters: Parameters,
     profile: str,
     options: Options,
-    out: Annotated[Path, typer.Option(help='The new bag; of several recordings, or a folder of them, their folder.')],
+    out: Annotated[Path, typer.Option(
+        metavar='PATH', parser=path_of, help='The new bag; of several recordings, or a folder of them, their folder.')],
     topic: Annotated[Optional[list[str]], typer.Option(help='Topic of images; all of them unless given.')] = None,
     start: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to start at.')] = None,
     end: Annotated[Optional[float], typer.Option(min=0, help='Seconds from the beginning to end at.')] = None,
@@ -90,7 +92,7 @@ def bag(
                 outcomes.append(_process(source, target, run, crew, quiet=quiet or as_json, salvage=salvage))
     except _Interrupted as error:
         errors.print(f'{error.number.name}: ended before all was done; --resume goes on from there', markup=False)
-        raise typer.Exit(INTERRUPTED[error.number]) from None
+        raise typer.Exit(STATUS[error.number]) from None
     status = _status(outcomes)
     if report:
         try:
@@ -204,11 +206,11 @@ def _interruptible() -> Iterator[None]:
     def interrupt(number: int, _: Any) -> None:
         nonlocal interrupted
         interrupted = True
-        for each in INTERRUPTED:
+        for each in STATUS:
             signal.signal(each, signal.SIG_IGN)
         raise _Interrupted(number)
 
-    before = {number: signal.signal(number, interrupt) for number in INTERRUPTED}
+    before = {number: signal.signal(number, interrupt) for number in STATUS}
     try:
         yield
     finally:

@@ -25,6 +25,13 @@ def fail(message: str) -> NoReturn:
     raise typer.Exit(2)
 
 
+def path_of(text: str) -> Path:
+    """The path that an argument names; an empty one, as of a variable that is not set, would be the current folder."""
+    if not text:
+        raise typer.BadParameter("a path is expected, got '' (. is the current folder)")
+    return Path(text)
+
+
 def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command, which takes `parameters`, options for a file, for `profile` and for each of Parameters instead.
 

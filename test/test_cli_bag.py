@@ -74,7 +74,7 @@ def test_a_topic_that_is_not_there_is_told_with_those_that_are(tmp_path):
 
 @pytest.mark.parametrize(('number', 'status'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signals_leave_no_target(tmp_path, number, status):
-    code = 'from line_feature_node.cli import main; main()'
+    code = 'from line_feature_node.command import main; main()'
     command = [sys.executable, '-c', code, 'bag', str(BAGS), '--out', str(tmp_path / 'out')]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     end = time.monotonic() + 60
@@ -123,7 +123,7 @@ class Command:
 
     def __init__(self, *arguments):
         self.process = subprocess.Popen(
-            [sys.executable, '-c', 'from line_feature_node.cli import main; main()', 'bag', *map(str, arguments)],
+            [sys.executable, '-c', 'from line_feature_node.command import main; main()', 'bag', *map(str, arguments)],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
     def end(self, number):
@@ -348,6 +348,14 @@ def test_options_that_make_no_sense_are_a_sentence(recording, tmp_path, argument
     assert [path.name for path in tmp_path.iterdir()] == ['rec']
 
 
+@pytest.mark.parametrize('arguments', [('', '--out', 'out'), ('rec', '', '--out', 'out'), ('rec', '--out', '')])
+def test_a_path_that_is_empty_is_a_sentence(recording, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob('*'))
+    assert "a path is expected, got ''" in usage(run(*arguments))
+    assert sorted(tmp_path.rglob('*')) == before
+
+
 def test_a_mask_that_cannot_be_read_is_a_sentence(recording, tmp_path):
     result = run(recording, '--out', tmp_path / 'out', '--mask-file', tmp_path / 'none.png')
     assert result.exit_code == 2
@@ -502,7 +510,7 @@ def small_disk(tmp_path):
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_a_disk_that_is_really_full_is_one_line_and_no_target(small_disk, tmp_path, storage, size):
     path = write(tmp_path / 'rec', film(200))
-    code = 'from line_feature_node.cli import main; main()'
+    code = 'from line_feature_node.command import main; main()'
     result = on_small_disk(size, small_disk, sys.executable, '-c', code, 'bag', path, '--out', 'out', '--copy',
                            '--storage', storage, '--workers', 1)
     assert result.returncode == 2
