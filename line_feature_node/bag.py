@@ -40,6 +40,7 @@ from line_feature_node.core import SEGMENT_DTYPE
 from line_feature_node.frames import Frames
 from line_feature_node.recordings import (
     METADATA,
+    OUTPUTS,
     RecordingError,
     Salvage,
     Slice,
@@ -50,7 +51,7 @@ from line_feature_node.recordings import (
     told,
     typestore,
 )
-from line_feature_node.slices import CSV, OUTPUTS, Frame, Job, process_slice, rests, unpack
+from line_feature_node.slices import CSV, Frame, Job, process_slice, rests, unpack
 from line_feature_node.workers import Workers, in_order, inline
 
 #: What is offered with results, as the node does: reliable, of depth 5.
@@ -115,7 +116,7 @@ class Outcome:
     Attributes:
         source, target: The recording and the bag that was made of it.
         frames: All of them, without their messages.
-        error: Why nothing came of it, one sentence; '' where something did.
+        error: Why nothing came of it, a sentence that does not begin with its path; '' where something did.
         uncopied: Topics that could not be copied, for want of their types.
         spoilt: How many messages could not be copied, by topic and reason.
         salvaged: What was salvaged of the recording, where that was needed.

@@ -20,9 +20,9 @@ from line_feature_node.command import INTERRUPTED
 from line_feature_node.core import Parameters
 from line_feature_node.files import read_mask, unique_names
 from line_feature_node.options import Options
-from line_feature_node.recordings import DamagedError, RecordingError, find_recordings
+from line_feature_node.recordings import OUTPUTS, DamagedError, RecordingError, find_recordings
 from line_feature_node.report import check_report, write_report
-from line_feature_node.slices import OUTPUTS, TRUTH, Frame, Job
+from line_feature_node.slices import TRUTH, Frame, Job
 from line_feature_node.workers import Workers, WorkersError, cluster, local
 
 #: Status of a process that SIGINT or SIGTERM ended, as shells have it.
@@ -128,10 +128,11 @@ def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool
     try:
         outcome = _read(source, target, run, crew, quiet=quiet, salvage=salvage)
     except (RecordingError, TargetError, WorkersError) as error:
-        outcome = Outcome(source, target, error=str(error))
+        # Workers call the recording by its whole path.
+        reason = str(error).removeprefix(f'{source}: ').removeprefix(f'{source.absolute()}: ')
+        outcome = Outcome(source, target, error=reason)
     if outcome.error:
-        errors.print(outcome.error if outcome.frames or str(source) in outcome.error else f'{source}: {outcome.error}',
-                     markup=False)
+        errors.print(f'{source}: {outcome.error}', markup=False)
     if outcome.salvaged:
         errors.print(f'{source}: {outcome.salvaged}', markup=False)
     for reason, count in outcome.failed.most_common():

@@ -39,7 +39,8 @@ from line_feature_node.files import read_mask
 from line_feature_node.images import compressed_image_of, displayable, image_of, range_hint, usable_pixels
 from line_feature_node.messages import Messages
 from line_feature_node.monitor import Monitor, Publishers, Throttle
-from line_feature_node.node_parameters import QOS_OVERRIDES, QOS_POLICIES, NodeParameters
+from line_feature_node.node_parameters import QOS_POLICIES, NodeParameters
+from line_feature_node.options import QOS_OVERRIDES
 from line_feature_node.overlay import draw_overlay, encode_jpeg
 from line_feature_node.parameter_files import read_parameter_file
 

@@ -17,8 +17,6 @@ from line_feature_node.options import Options
 
 #: Parameters that rclpy itself declares.
 BUILT_IN = {'use_sim_time', 'start_type_description_service'}
-#: How the names of rclpy's parameters for quality of service begin.
-QOS_OVERRIDES = 'qos_overrides.'
 #: The policies that may be overridden, with their values; depth is a number.
 QOS_POLICIES: dict[str, tuple[str, ...]] = {
     'history': ('keep_last', 'keep_all', 'system_default'),

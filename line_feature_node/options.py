@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from line_feature_node.core import PROFILES
 from line_feature_node.core.parameters import ParameterSet, parameter
 
+#: How the names of rclpy's parameters for quality of service begin.
+QOS_OVERRIDES = 'qos_overrides.'
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Options(ParameterSet):

@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 
 from line_feature_node.core import Parameters
-from line_feature_node.options import Options
+from line_feature_node.options import QOS_OVERRIDES, Options
 
 
 def read_parameter_file(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -16,7 +16,8 @@ def read_parameter_file(path: Path) -> tuple[dict[str, Any], list[str]]:
         path: A file as `--params-file` of a node takes it.
 
     Returns:
-        Values by name, for Parameters and Options; and the names that are in neither.
+        Values by name, for Parameters and Options; and the names that are in neither, but for those of quality of
+        service, which a recording has none of.
 
     Raises:
         ValueError: It cannot be read, or is no such file; the message is a sentence.
@@ -44,7 +45,7 @@ def _read(path: Path) -> tuple[dict[str, Any], list[str]]:
         values.update(_flattened(section))
     known = {*Parameters.specs(), *Options.specs()}
     return ({name: value for name, value in values.items() if name in known},
-            [str(name) for name in values if name not in known])
+            [str(name) for name in values if name not in known and not str(name).startswith(QOS_OVERRIDES)])
 
 
 def _flattened(section: dict[str, Any], before: str = '') -> dict[str, Any]:

@@ -18,6 +18,11 @@ from line_feature_node.images import compressed_image_of, image_of
 
 #: How the picture of a message is had, by its type.
 DECODERS = {'sensor_msgs/msg/Image': image_of, 'sensor_msgs/msg/CompressedImage': compressed_image_of}
+#: What is made of a frame, by the ending of its topic, with the type of the message.
+OUTPUTS = {
+    'segments': 'sensor_msgs/msg/PointCloud2', 'markers': 'visualization_msgs/msg/ImageMarker',
+    'overlay': 'sensor_msgs/msg/CompressedImage',
+}
 #: Files that are recordings, or parts of one.
 SUFFIXES = ('.bag', '.db3', '.mcap')
 METADATA = 'metadata.yaml'
@@ -200,7 +205,10 @@ def told(path: Path) -> Iterator[None]:
 
 
 def _reason(error: Exception) -> str:
-    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
+    # Some have a tuple of their words instead of words.
+    [text] = error.args if len(error.args) == 1 else [error]
+    words = ' '.join(map(str, text)) if isinstance(text, tuple) else str(error)
+    return ' '.join(words.split()).rstrip('.') or type(error).__name__
 
 
 def is_ros1(path: Path) -> bool:
@@ -212,6 +220,14 @@ def image_topics(reader: Reader) -> dict[str, str]:
     """Topics that have images, with their message types."""
     return {connection.topic: connection.msgtype for connection in reader.connections
             if connection.msgtype in DECODERS}
+
+
+def _overlays(reader: Reader) -> set[str]:
+    """Topics of overlays that an earlier run made: they are beside its segments."""
+    present = {(connection.topic, connection.msgtype) for connection in reader.connections}
+    bases = {topic.removesuffix('/segments') for topic, _ in present if topic.endswith('/segments')}
+    return {f'{base}/overlay' for base in bases
+            if {(f'{base}/{name}', OUTPUTS[name]) for name in ('segments', 'overlay')} <= present}
 
 
 @cache
@@ -254,7 +270,7 @@ def plan(
 
     Args:
         path: The recording.
-        topics: Topics to be processed; empty for all that have images.
+        topics: Topics to be processed; empty for all that have images, but for overlays of an earlier run.
         start, end: Seconds from the beginning of the recording, up to infinity.
         every: One of so many frames of a topic is to be processed.
 
@@ -269,7 +285,7 @@ def plan(
         for topic in topics:
             if topic not in known:
                 raise RecordingError(f'{path}: no images on {topic!r}, but on {", ".join(sorted(known)) or "no topic"}')
-        chosen = tuple(dict.fromkeys(topics or sorted(known)))
+        chosen = tuple(dict.fromkeys(topics or sorted(known.keys() - _overlays(reader))))
         connections = [connection for connection in reader.connections if connection.topic in chosen]
         count = sum(connection.msgcount for connection in connections)
         if not connections or not count:

@@ -4,7 +4,6 @@ import base64
 import contextlib
 import importlib.metadata
 import math
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
@@ -19,8 +18,8 @@ from line_feature_node.core import Parameters
 from line_feature_node.markup import Markup, joined, tag
 from line_feature_node.overlay import encode_jpeg
 from line_feature_node.plots import Plot, Values, clock, colour_key, number, rose, time_plot, with_unit
-from line_feature_node.recordings import RecordingError, deserialize, opened
-from line_feature_node.slices import BANDS, OUTPUTS, Frame
+from line_feature_node.recordings import OUTPUTS, RecordingError, deserialize, opened
+from line_feature_node.slices import BANDS, Frame
 
 STYLE = Path(__file__).with_name('report.css')
 #: Columns of all plots of a page together, and the most and the fewest that one gets.
@@ -106,8 +105,11 @@ def check_report(path: Path, pairs: list[tuple[Path, Path]], *, overwrite: bool)
             raise TargetError(f'the report {path} cannot be written: it is there, and no file')
         if path.exists() and not overwrite:
             raise TargetError(f'the report {path} exists: --overwrite replaces it')
-    if path.parent.is_dir() and not os.access(path.parent, os.W_OK | os.X_OK):
-        raise TargetError(f'cannot write {path}: the folder is not to be written to')
+        if path.parent.is_dir():
+            beside = _beside(path)
+            if not beside.exists():  # permissions do not tell all: it is tried
+                beside.touch()
+                beside.unlink()
 
 
 def write_report(path: Path, outcomes: list[Outcome], run: Run, profile: str, *, overwrite: bool) -> None:
@@ -125,7 +127,7 @@ def write_report(path: Path, outcomes: list[Outcome], run: Run, profile: str, *,
     """
     # Paths may have bytes that are no text.
     data = page(outcomes, run, profile).encode('utf-8', 'backslashreplace')
-    beside = path.with_name(f'{path.name}.partial')
+    beside = _beside(path)
     with _told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -135,6 +137,11 @@ def write_report(path: Path, outcomes: list[Outcome], run: Run, profile: str, *,
             beside.replace(path)
         finally:
             beside.unlink(missing_ok=True)
+
+
+def _beside(path: Path) -> Path:
+    """What a page is written to until it is whole."""
+    return path.with_name(f'{path.name}.partial')
 
 
 @contextlib.contextmanager
@@ -326,7 +333,7 @@ def _has_truth(recording: Recording) -> bool:
 
 def _why(outcome: Outcome) -> str:
     """Why nothing came of a recording, without its name before it."""
-    return outcome.error.removeprefix(f'{outcome.source}: ') or 'no frames'
+    return outcome.error or 'no frames'
 
 
 def _table(heads: list[str], rows: list[Markup], name: str, class_: str = '') -> Markup:

@@ -19,14 +19,9 @@ from line_feature_node.core import LineFeatureExtractor, Parameters, end_points
 from line_feature_node.images import displayable, usable_pixels
 from line_feature_node.messages import Messages, segments_of
 from line_feature_node.overlay import draw_overlay, encode_jpeg
-from line_feature_node.recordings import DECODERS, SLICE, Reader, Slice, deserialize, kept_open, typestore
+from line_feature_node.recordings import DECODERS, OUTPUTS, SLICE, Reader, Slice, deserialize, kept_open, typestore
 from line_feature_node.truth import compare
 
-#: What is made of a frame, by the ending of its topic, with the type of the message.
-OUTPUTS = {
-    'segments': 'sensor_msgs/msg/PointCloud2', 'markers': 'visualization_msgs/msg/ImageMarker',
-    'overlay': 'sensor_msgs/msg/CompressedImage',
-}
 #: Ending of the topic that may have the true segments of an image topic.
 TRUTH = 'truth'
 #: Name of the segments as text among the messages.

@@ -48,8 +48,8 @@ from line_feature_node.bag import Run, TargetError, process_recording
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, Parameters
 from line_feature_node.images import decode
 from line_feature_node.messages import segments_of
-from line_feature_node.recordings import RecordingError, deserialize, find_recordings
-from line_feature_node.slices import OUTPUTS, Job
+from line_feature_node.recordings import OUTPUTS, RecordingError, deserialize, find_recordings
+from line_feature_node.slices import Job
 from line_feature_node.workers import Workers, WorkersError, cluster, inline, local
 
 CORRIDOR = Path(__file__).resolve().parents[1] / 'bags' / 'corridor'
@@ -1215,7 +1215,8 @@ def test_a_bag_that_may_not_grow_is_a_sentence(tmp_path, storage):
 def test_a_result_is_a_recording_like_any_other(source, tmp_path):
     process(source, tmp_path / 'out')
     assert find_recordings([tmp_path]) == [tmp_path / 'out']
-    outcome = process(tmp_path / 'out', tmp_path / 'again', job=SEGMENTS)
+    assert process(tmp_path / 'out', tmp_path / 'again', job=SEGMENTS).error == bag.NO_IMAGES
+    outcome = process(tmp_path / 'out', tmp_path / 'again', job=SEGMENTS, topics=('/camera/overlay',))
     assert {frame.topic for frame in outcome.frames} == {'/camera/overlay'}
 
 

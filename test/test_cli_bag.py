@@ -232,9 +232,20 @@ def test_json_says_what_failed(tmp_path):
     result = run(tmp_path / 'in', '--out', tmp_path / 'out', '--json')
     assert result.exit_code == 1
     bad, good = json.loads(result.stdout)['recordings']
-    assert 'cannot be read' in bad['error']
+    assert bad['error'].startswith('cannot be read')
     assert (good['frames'], sum(good['failed'].values()), good['error']) == (4, 1, '')
     assert len(result.stderr.splitlines()) == 2
+
+
+@pytest.mark.parametrize('name', ['empty.bag', 'words', 'rec'])
+def test_json_has_no_path_before_the_error(recording, tmp_path, monkeypatch, name):
+    (tmp_path / 'empty.bag').touch()
+    write(tmp_path / 'words', [('/words', TEXT, BEGIN, text('a'))])
+    monkeypatch.chdir(tmp_path)
+    result = run(name, '--out', 'out', '--topic', '/nothing', '--json')
+    [summary] = json.loads(result.stdout)['recordings']
+    assert name not in summary['error']
+    assert result.stderr == f'{name}: {summary["error"]}\n'
 
 
 def strict(data):

@@ -25,6 +25,13 @@ def test_sections_of_nodes_and_namespaces_are_found_and_unknown_names_told(tmp_p
     assert read_parameter_file(path) == ({'T1': 50}, ['use_sim_time'])
 
 
+def test_quality_of_service_is_not_told_as_unknown(tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text('/**: {ros__parameters: {qos_overrides: {/image: {subscription: {depth: 9}}}, T1: 50}}\n'
+                    'node: {ros__parameters: {qos_overrides./image.subscription.reliability: reliable, qos: 1}}')
+    assert read_parameter_file(path) == ({'T1': 50}, ['qos'])
+
+
 def test_nested_names_are_joined_by_points(tmp_path):
     path = tmp_path / 'some.yaml'
     path.write_text('/**: {ros__parameters: {camera: {fps: 30, size: {width: 640}}, T1: 9.0}}')

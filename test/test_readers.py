@@ -18,8 +18,8 @@ from test_bag import CORRIDOR, TOPIC
 from line_feature_node.bag import Run, process_recording
 from line_feature_node.core import Parameters
 from line_feature_node.messages import segments_of
-from line_feature_node.recordings import deserialize, opened
-from line_feature_node.slices import OUTPUTS, Job
+from line_feature_node.recordings import OUTPUTS, deserialize, opened
+from line_feature_node.slices import Job
 from line_feature_node.workers import inline
 
 NPM = Path(__file__).resolve().parent / 'npm'

@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from line_feature_node import recordings
 from line_feature_node.recordings import (
+    OUTPUTS,
     DamagedError,
     RecordingError,
     deserialize,
@@ -303,6 +304,25 @@ def test_image_topics_are_those_with_images(tmp_path):
     path = write(tmp_path / 'rec', [*film(1), ('/small', COMPRESSED, BEGIN, jpeg), ('/words', TEXT, BEGIN, text('a'))])
     with opened(path) as reader:
         assert image_topics(reader) == {'/camera': IMAGE, '/small': COMPRESSED}
+
+
+def test_overlays_of_an_earlier_run_are_processed_only_if_named(tmp_path):
+    segments, overlay = OUTPUTS['segments'], OUTPUTS['overlay']
+    path = write(tmp_path / 'rec', film(2), empty=[
+        ('/camera/segments', segments), ('/camera/overlay', overlay), ('/other/segments', TEXT),
+        ('/other/overlay', overlay), ('/alone/overlay', overlay), ('/raw/segments', segments), ('/raw/overlay', IMAGE)])
+    chosen = '/alone/overlay', '/camera', '/other/overlay', '/raw/overlay'
+    assert {part.topics for part in plan(path, topics=[])} == {chosen}
+    named = '/camera', '/camera/overlay'
+    assert {part.topics for part in plan(path, topics=list(named))} == {named}
+
+
+@pytest.mark.parametrize(('error', 'words'), [
+    (LookupError(('Header could', 'not be read.')), 'Header could not be read'), (LookupError('a', 1), r"\('a', 1\)"),
+    (LookupError(('Header is cut.',)), 'Header is cut'), (LookupError(()), 'LookupError'), (KeyError('a'), "'a'")])
+def test_what_a_library_says_is_told_as_words(recording, error, words):
+    with pytest.raises(DamagedError, match=rf'rec: cannot be read \({words}\)$'), opened(recording):
+        raise error
 
 
 def test_an_error_in_the_block_is_a_sentence_and_those_of_this_package_stay(recording):

@@ -161,7 +161,7 @@ def test_parameters_that_differ_are_told():
 
 
 def test_several_recordings_are_a_table_with_a_section_each(tmp_path):
-    unread = Outcome(Path('/somewhere/cut.bag'), tmp_path, error='/somewhere/cut.bag: cannot be read (cut)')
+    unread = Outcome(Path('/somewhere/cut.bag'), tmp_path, error='cannot be read (cut)')
     made = read(outcome(frames(5), 'one'), unread, outcome(frames(7, agreement=[0.5, 0.25, 0.1, 1.0]), 'two'))
     table = {row[0]: row[1:] for row in made.rows}
     assert table['one.bag'][1:3] == ['0.04\u00a0s', '5']
@@ -282,7 +282,7 @@ def test_names_that_are_no_text_can_be_written(tmp_path):
     ('there.html', '--overwrite replaces it'), ('folder', 'it is there, and no file'), ('none/a.html', 'no folder'),
     ('there.html/a.html', 'no folder'), ('in/rec/a.html', 'in the place of the recording'),
     ('in/rec', 'in the place of the recording'), ('out/a.html', 'in the place of the new bag'),
-    ('pipe', 'it is there, and no file'), ('x' * 300, 'File name too long')])
+    ('pipe', 'it is there, and no file'), ('x' * 300, 'File name too long'), ('x' * 250, 'File name too long')])
 def test_what_cannot_be_written_is_told_before_the_run(tmp_path, name, reason):
     for folder in ('folder', 'in/rec'):
         (tmp_path / folder).mkdir(parents=True)
@@ -291,9 +291,23 @@ def test_what_cannot_be_written_is_told_before_the_run(tmp_path, name, reason):
     pairs = [(tmp_path / 'in' / 'rec', tmp_path / 'out')]
     with pytest.raises(TargetError, match=reason):
         check_report(tmp_path / name, pairs, overwrite=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['folder', 'in', 'pipe', 'there.html']
     if 'overwrite' not in reason:
         with pytest.raises(TargetError, match=reason):
             check_report(tmp_path / name, pairs, overwrite=True)
+
+
+@pytest.mark.skipif(not Path('/proc/self').exists(), reason='no folder that even its owner cannot write to')
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_run_even_to_root(tmp_path):
+    with pytest.raises(TargetError, match='^cannot write /proc/self/report.html: '):
+        check_report(Path('/proc/self/report.html'), [(tmp_path / 'in', tmp_path / 'out')], overwrite=False)
+
+
+def test_the_check_leaves_nothing_and_takes_nothing(tmp_path):
+    (tmp_path / 'b.html.partial').write_text('mine')
+    for name in ('a.html', 'b.html'):
+        check_report(tmp_path / name, [(tmp_path / 'in', tmp_path / 'out')], overwrite=False)
+    assert [path.name for path in tmp_path.iterdir()] == ['b.html.partial']
 
 
 def test_a_page_may_be_beside_the_bags_in_a_folder_that_is_to_be_made(tmp_path):

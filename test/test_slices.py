@@ -35,12 +35,11 @@ from line_feature_node.bag import Run, process_recording
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, Parameters
 from line_feature_node.messages import segments_of
 from line_feature_node.overlay import COLOURS
-from line_feature_node.recordings import DECODERS, RecordingError, deserialize, find_recordings, opened, plan
+from line_feature_node.recordings import DECODERS, OUTPUTS, RecordingError, deserialize, find_recordings, opened, plan
 from line_feature_node.slices import (
     CSV,
     LIMIT,
     MESSAGES,
-    OUTPUTS,
     Frame,
     Job,
     pack,
