@@ -11,6 +11,7 @@ from line_feature_node.core import LineFeatureExtractor, Parameters
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.edges import PAD, extract_edges, kept_gradient
 from line_feature_node.core.noise import (
+    CLUTTERED,
     ROUNDING,
     STEP,
     STRONG_SHARE,
@@ -166,10 +167,10 @@ def test_noise_and_few_edges_are_no_clutter(sigma: float) -> None:
 
 def test_clutter_raises_the_thresholds() -> None:
     """Unless T1 does not depend on the picture at all."""
-    quality = Quality(1.0, 30.0, 20.0)
+    quality = Quality(1.0, 7.0, 3.5)
     found = adapted(Parameters(), quality)
     raised = found.T1, found.T2
-    assert raised == pytest.approx((30, 20), abs=STEP)
+    assert raised == pytest.approx((7, 3.5), abs=STEP)
     assert adapted(Parameters(noise_T1=0.0, noise_T2=0.0), quality).T1 == Parameters().T1
     assert adapted(Parameters.paper(), quality) == Parameters.paper()
     found = adapted(Parameters(), Quality(1.0, 20.0, 20.0))
@@ -284,3 +285,17 @@ def test_masked_pixels_do_not_tell_what_the_noise_is(share: float) -> None:
     assert len(expected.segments) == 0
     assert (found.segments['y'] < first).all()
     assert (found.edges[inner] != 0).mean() < 2 * (expected.edges[inner] != 0).mean() + 0.002
+
+
+def test_clutter_raises_the_thresholds_by_so_much_at_most() -> None:
+    """A fence fills the picture with edges that are all as strong."""
+    found = adapted(Parameters(T1=5.0, T2=3.0), Quality(1.0, 100.0, 90.0))
+    assert (found.T1, found.T2) == (CLUTTERED * 5, CLUTTERED * 3)
+
+
+@pytest.mark.parametrize('width', [4, 8, 16])
+def test_stripes_that_fill_the_picture_are_found(width: int) -> None:
+    image = np.tile(np.where(np.arange(320) // width % 2, 200, 40).astype(np.uint8), (240, 1))
+    segments = LineFeatureExtractor().extract(image)
+    assert len(segments) == pytest.approx(320 / width - 1, abs=2)
+    np.testing.assert_allclose(abs(segments['theta']), np.pi / 2, atol=1e-3)
