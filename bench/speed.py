@@ -2,9 +2,9 @@
 
     python bench/speed.py [PHOTO ...] [--reps 15] [--results FOLDER]
 
-One thread, all contestants in turn on the same picture in one run; of each picture the best processor time counts, of the
-pictures the median. Milliseconds differ between machines and hours: quote the ratios. Without photographs a rendered
-corridor stands in for them, which has fewer edges than most. With a folder for results, two curves are measured and
+One thread, all contestants in turn on the same picture in one run; of each picture the least processor time counts, of
+the pictures the median. Milliseconds differ between machines and hours: quote the ratios. Without photographs rendered
+corridors stand in for them, which have fewer edges than most. With a folder for results, two curves are measured and
 drawn as well (matplotlib): time by pixels, and by edge pixels at one size.
 """
 

@@ -283,6 +283,10 @@ class _Work:
     def __enter__(self) -> '_Work':
         self._folder.mkdir(parents=True, exist_ok=True)
         place = self._folder / 'lock'
+        others = sorted(self._folder.iterdir())
+        if others and not place.exists():  # the lock is what a run makes first
+            raise TargetError(f'{self._folder} is not what an earlier run left, {others[0].name} is in it: '
+                              f'move it away')
         self._lock = os.open(place, os.O_CREAT | os.O_RDWR)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
