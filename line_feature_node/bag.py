@@ -283,11 +283,6 @@ class _Work:
     def __enter__(self) -> '_Work':
         self._folder.mkdir(parents=True, exist_ok=True)
         place = self._folder / 'lock'
-        own = {place, self._journal, self._replaced, self._bag.parent, self._folder / 'run.json'}
-        others = sorted(set(self._folder.iterdir()) - own)
-        if others and not place.exists():  # the lock is what a run makes first
-            raise TargetError(f'{self._folder} is not what an earlier run left, {others[0].name} is in it: '
-                              f'move it away')
         self._lock = os.open(place, os.O_CREAT | os.O_RDWR)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
