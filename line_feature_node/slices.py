@@ -253,7 +253,8 @@ def _header(header: Any) -> Any:
 
 def _orientations(segments: NDArray[np.void]) -> list[float]:
     bands = np.floor((segments['theta'] / np.pi + 0.5) * BANDS).clip(0, BANDS - 1).astype(int)
-    return [round(float(length), 1) for length in np.bincount(bands, segments['length'], BANDS)]
+    lengths: list[float] = np.bincount(bands, segments['length'], BANDS).round(1).tolist()
+    return lengths
 
 
 def _agreement(segments: NDArray[np.void], truth: NDArray[np.void]) -> list[float]:

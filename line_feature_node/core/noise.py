@@ -74,27 +74,32 @@ def measure(
     total = count_differences(image, ALL if keep is None else keep, scale * RESOLUTION, counts)
     if total == 0:
         return Quality(ROUNDING)
-    noise = max(quantile(counts[0], 0.5 * total) / (RESOLUTION * MEDIAN * GAIN), ROUNDING)
-    strong, weak = (exceeded_by(share, counts[1], total, noise) for share in (STRONG_SHARE, WEAK_SHARE))
+    differences, gradients = np.cumsum(counts, axis=1)
+    noise = max(quantile(differences, 0.5 * total) / (RESOLUTION * MEDIAN * GAIN), ROUNDING)
+    strong, weak = (exceeded_by(share, gradients, total, noise) for share in (STRONG_SHARE, WEAK_SHARE))
     return Quality(noise, strong, weak)
 
 
-def exceeded_by(share: float, counts: NDArray[np.int64], total: int, noise: float) -> float:
+def exceeded_by(share: float, sums: NDArray[np.int64], total: int, noise: float) -> float:
     """The gradient that a share of the pixels exceeds, without what the noise adds to its square.
 
     Of noise alone the norm has Rayleigh's distribution, which a share s exceeds sqrt(-2 ln s) standard deviations.
     """
-    gradient = quantile(counts, (1 - share) * total) / (RESOLUTION * SOBEL)
+    gradient = quantile(sums, (1 - share) * total) / (RESOLUTION * SOBEL)
     of_noise = math.sqrt(-2 * math.log(share)) * SOBEL_NOISE * noise
     return math.sqrt(max(gradient**2 - of_noise**2, 0.0))
 
 
-def quantile(counts: NDArray[np.int64], wanted: float) -> float:
-    """The value below which so many are, in a histogram of whole numbers that stand for the values around them."""
-    sums = np.cumsum(counts)
-    k = int(np.searchsorted(sums, wanted))
-    before = sums[k] - counts[k]
-    return max(k - 0.5 + (wanted - before) / max(counts[k], 1), 0.0)
+def quantile(sums: NDArray[np.int64], wanted: float) -> float:
+    """The value below which so many are, from the sums of a histogram of whole numbers that stand for what is around.
+
+    Args:
+        sums: How many values are in each bin and those before.
+        wanted: How many are to be below, more than 0.
+    """
+    k = int(np.searchsorted(sums, math.ceil(wanted)))  # as a float it would have all sums converted
+    before = int(sums[k - 1]) if k else 0
+    return max(k - 0.5 + (wanted - before) / max(int(sums[k]) - before, 1), 0.0)
 
 
 @inlined

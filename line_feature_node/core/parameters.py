@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -66,14 +67,25 @@ class ParameterSet:
             object.__setattr__(self, field.name, _checked(field, getattr(self, field.name)))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, type(self)) and self._key() == other._key()
+        return self is other or isinstance(other, type(self)) and self._key == other._key
 
     def __hash__(self) -> int:
-        return hash(self._key())
+        return self._hash
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The values alone: hashes differ between processes."""
+        return {field.name: getattr(self, field.name) for field in _fields(self)}
+
+    @cached_property
+    def _hash(self) -> int:
+        """Taken once, as every frame looks up several times what was made for its parameters."""
+        return hash(self._key)
+
+    @cached_property
     def _key(self) -> tuple[Any, ...]:
         """All values; None for unset ones, since NaN is not equal to itself."""
-        return tuple(None if value != value else value for value in vars(self).values())
+        values = (getattr(self, field.name) for field in _fields(self))
+        return tuple(None if value != value else value for value in values)
 
     @classmethod
     def of(cls: type[Self], values: Mapping[str, Any]) -> Self:
