@@ -41,6 +41,8 @@ from line_feature_node.frames import Frames
 from line_feature_node.recordings import (
     METADATA,
     OUTPUTS,
+    SALVAGE,
+    SALVAGED,
     RecordingError,
     Salvage,
     Slice,
@@ -282,6 +284,7 @@ class _Work:
 
     def __enter__(self) -> '_Work':
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._see_that_all_is_ours()
         place = self._folder / 'lock'
         self._lock = os.open(place, os.O_CREAT | os.O_RDWR)
         try:
@@ -297,6 +300,15 @@ class _Work:
             self._clear_up()
             raise
         return self
+
+    def _see_that_all_is_ours(self) -> None:
+        """The folder is removed in the end, with all that is in it."""
+        ours = {'lock', 'run.json', 'run.json.new', SALVAGED, TABLE, *(
+            folder.name for folder in (self._journal, self._replaced, self._bag.parent))}
+        for entry in self._folder.iterdir():
+            if entry.name not in ours and not entry.name.startswith(SALVAGE):
+                raise TargetError(f'{self._folder} is not what an earlier run left, {entry.name} is in it: '
+                                  f'move it away')
 
     def _begin(self) -> None:
         described = json.dumps(self._description(), default=str, sort_keys=True)

@@ -72,42 +72,30 @@ def bag(
     if storage not in ('mcap', 'sqlite3'):
         raise typer.BadParameter(f'storage must be mcap or sqlite3, got {storage!r}')
     try:
-        # As in the node, a path in the file is relative to the folder that one is in.
-        masks = [*([mask_file] if mask_file else []), *([Path(options.mask_file)] if options.mask_file else [])]
-        mask = read_mask(masks[0]) if masks else None
-        sources = find_recordings(recordings)
-        pairs = list(_targets(recordings, sources, out))
-        job = Job(parameters, mask, outputs=('segments',) if only_segments else tuple(OUTPUTS), truth=truth, csv=csv,
-                  jpeg_quality=options.jpeg_quality)
+        pairs = list(_targets(recordings, find_recordings(recordings), out))
+        job = Job(parameters, _mask(mask_file, options), outputs=('segments',) if only_segments else tuple(OUTPUTS),
+                  truth=truth, csv=csv, jpeg_quality=options.jpeg_quality)
         run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)
         if report:
             check_report(report, pairs, overwrite=overwrite)
         crew = cluster(scheduler) if scheduler else local(workers)
     except (RecordingError, TargetError, WorkersError, ValueError) as error:
         fail(str(error))
-    outcomes = []
-    try:
-        with _interruptible():
-            for source, target in pairs:
-                outcomes.append(_process(source, target, run, crew, quiet=quiet or as_json, salvage=salvage))
-    except _Interrupted as error:
-        errors.print(f'{error.number.name}: ended before all was done; --resume goes on from there', markup=False)
-        raise typer.Exit(STATUS[error.number]) from None
+    outcomes = _process_all(pairs, run, crew, quiet=quiet or as_json, salvage=salvage)
     status = _status(outcomes)
-    if report:
-        try:
-            write_report(report, outcomes, run, profile, overwrite=overwrite)
-        except TargetError as error:
-            errors.print(str(error), markup=False)
-            status = max(status, 1)
+    if report and not _reported(report, outcomes, run, profile):
+        status = max(status, 1)
     if as_json:
         print(json.dumps({'recordings': [_summary(outcome) for outcome in outcomes]}))
     elif not quiet:
-        for outcome in outcomes:
-            if outcome.frames:
-                console.print(f'{outcome.source}: written to {outcome.target}', markup=False)
-                console.print(_table(outcome))
+        _show(outcomes)
     raise typer.Exit(status)
+
+
+def _mask(mask_file: Path | None, options: Options) -> NDArray[np.uint8] | None:
+    """The mask that was given; as in the node, a path in a file of options is relative to the folder that one is in."""
+    path = mask_file or (Path(options.mask_file) if options.mask_file else None)
+    return read_mask(path) if path else None
 
 
 def _targets(recordings: list[Path], sources: list[Path], out: Path) -> Iterator[tuple[Path, Path]]:
@@ -121,6 +109,31 @@ def _targets(recordings: list[Path], sources: list[Path], out: Path) -> Iterator
     names = unique_names(source.name if source.is_dir() else source.stem for source in sources)
     for source, name in zip(sources, names, strict=True):
         yield source, out / name
+
+
+def _process_all(
+    pairs: list[tuple[Path, Path]], run: Run, crew: Workers, *, quiet: bool, salvage: bool,
+) -> list[Outcome]:
+    """Process one recording after the other; a signal ends it with a line on standard error."""
+    outcomes: list[Outcome] = []
+    try:
+        with _interruptible():
+            for source, target in pairs:
+                outcomes.append(_process(source, target, run, crew, quiet=quiet, salvage=salvage))
+    except _Interrupted as error:
+        errors.print(f'{error.number.name}: ended before all was done; --resume goes on from there', markup=False)
+        raise typer.Exit(STATUS[error.number]) from None
+    return outcomes
+
+
+def _reported(report: Path, outcomes: list[Outcome], run: Run, profile: str) -> bool:
+    """Write the page; where it cannot be, that is a line on standard error."""
+    try:
+        write_report(report, outcomes, run, profile, overwrite=run.overwrite)
+    except TargetError as error:
+        errors.print(str(error), markup=False)
+        return False
+    return True
 
 
 def _process(source: Path, target: Path, run: Run, crew: Workers, *, quiet: bool, salvage: bool) -> Outcome:
@@ -260,6 +273,14 @@ def _median(values: NDArray[np.floating]) -> float | None:
     """Of those that are numbers; None where none is."""
     known = values[~np.isnan(values)]
     return float(np.median(known)) if len(known) else None
+
+
+def _show(outcomes: list[Outcome]) -> None:
+    """Print what became of recordings that had images."""
+    for outcome in outcomes:
+        if outcome.frames:
+            console.print(f'{outcome.source}: written to {outcome.target}', markup=False)
+            console.print(_table(outcome))
 
 
 def _table(outcome: Outcome) -> Table:

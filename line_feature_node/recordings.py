@@ -64,6 +64,10 @@ class Slice:
     after: int = 0
 
 
+#: In the folder for what is under way: says that a salvaged recording was gone over, and begins the names of those.
+SALVAGED, SALVAGE = 'salvaged', 'salvage-'
+
+
 @dataclass(frozen=True)
 class Salvage:
     """What was salvaged of a recording.

@@ -12,11 +12,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys.msg import normalize_msgtype
 
-from line_feature_node.recordings import METADATA, TOLD, RecordingError, Salvage
+from line_feature_node.recordings import METADATA, SALVAGE, SALVAGED, TOLD, RecordingError, Salvage
 from line_feature_node.remains import MCAP, ROS1, SQLITE3, ZSTD, Channel, Message, kind_of, readable, remains
-
-#: In the folder for what is under way it says that the recording there is a salvaged one.
-MARK = 'salvaged'
 
 
 @contextlib.contextmanager
@@ -35,23 +32,23 @@ def salvaged(source: Path, place: Path) -> Iterator[Salvage]:
             try:
                 place.mkdir(parents=True, exist_ok=True)
                 folder = stack.enter_context(
-                    tempfile.TemporaryDirectory(prefix='salvage-', dir=place, ignore_cleanup_errors=True))
+                    tempfile.TemporaryDirectory(prefix=SALVAGE, dir=place, ignore_cleanup_errors=True))
                 found = _save(source, Path(folder))
-                (place / MARK).touch()
+                (place / SALVAGED).touch()
             except OSError as error:
                 raise RecordingError(f'{source}: what is left of it cannot be written to {place}: '
                                      f'{error.strerror or error}') from error
             yield found
     finally:
         with contextlib.suppress(OSError):
-            if {path.name for path in place.iterdir()} <= {MARK}:
-                (place / MARK).unlink(missing_ok=True)
+            if {path.name for path in place.iterdir()} <= {SALVAGED}:
+                (place / SALVAGED).unlink(missing_ok=True)
                 place.rmdir()
 
 
 def was_salvaged(place: Path) -> bool:
     """Whether a run that was ended went over a salvaged recording."""
-    return (place / MARK).exists()
+    return (place / SALVAGED).exists()
 
 
 def may_help(source: Path) -> bool:

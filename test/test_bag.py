@@ -1276,6 +1276,18 @@ def test_segments_agree_with_the_truth(tmp_path):
     assert recall > 0.7
 
 
+@pytest.mark.parametrize('options', [{}, {'resume': True}, {'overwrite': True}])
+def test_a_folder_of_others_in_the_place_of_what_is_under_way_is_left_alone(source, tmp_path, options):
+    thesis = tmp_path / 'out.partial' / 'thesis.txt'
+    thesis.parent.mkdir()
+    thesis.write_text('mine')
+    with pytest.raises(TargetError, match='is not what an earlier run left, thesis.txt is in it') as error:
+        process(source, tmp_path / 'out', **options)
+    one_sentence(error)
+    assert [path.name for path in tmp_path.rglob('*') if path.parent != source] == ['out.partial', 'thesis.txt']
+    assert thesis.read_text() == 'mine'
+
+
 def test_a_target_that_exists_is_refused_or_replaced_as_a_whole(tmp_path):
     target = tmp_path / 'out'
     old_bag(target)

@@ -16,8 +16,8 @@ from test_recordings import ROS1, contents, film, lone, stamp_of, text, write, w
 from line_feature_node import bag
 from line_feature_node.bag import Run, partial_folder, process_recording
 from line_feature_node.core import Parameters
-from line_feature_node.recordings import RecordingError, opened
-from line_feature_node.salvage import MARK, may_help, salvaged, was_salvaged
+from line_feature_node.recordings import SALVAGED, RecordingError, opened
+from line_feature_node.salvage import may_help, salvaged, was_salvaged
 from line_feature_node.slices import Job
 from line_feature_node.workers import inline
 
@@ -155,7 +155,7 @@ def test_what_a_run_leaves_for_a_later_one_stays(tmp_path):
     source = cut(make(tmp_path, 'mcap'))
     with salvaged(source, tmp_path / 'place'):
         (tmp_path / 'place' / 'run.json').touch()
-    assert {path.name for path in (tmp_path / 'place').iterdir()} == {MARK, 'run.json'}
+    assert {path.name for path in (tmp_path / 'place').iterdir()} == {SALVAGED, 'run.json'}
 
 
 def test_it_is_the_same_each_time(tmp_path):

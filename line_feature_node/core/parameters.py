@@ -67,7 +67,7 @@ class ParameterSet:
             object.__setattr__(self, field.name, _checked(field, getattr(self, field.name)))
 
     def __eq__(self, other: object) -> bool:
-        return self is other or isinstance(other, type(self)) and self._key == other._key
+        return self is other or (isinstance(other, type(self)) and self._key == other._key)
 
     def __hash__(self) -> int:
         return self._hash
