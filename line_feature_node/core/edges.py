@@ -38,8 +38,6 @@ ONE = np.float32(1)
 NO_MARK, CODE_1, CODE_2, CODE_3, CODE_4, STRONG_MARK = (np.uint8(mark) for mark in (0, 1, 2, 3, 4, STRONG))
 #: Half a section of the gradient space is 22.5 degrees.
 SECTION = np.float32(math.tan(math.pi / 8))
-#: Names of the components of the gradient among the buffers.
-GRADIENT = ('gx', 'gy')
 #: Added to every pixel: the recursion would fade into denormal numbers, which are slow, beside a black area.
 PEDESTAL = 1.0
 
@@ -66,7 +64,7 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     rows = buffers.image('rows', 9, columns, np.float32)
     # Refinement looks at the gradient; without, only three rows are needed at a time.
     depth = lines + 2 * PAD if parameters.refine else 3
-    gx, gy = (buffers.image(name, depth, columns, np.float32) for name in GRADIENT)
+    gx, gy = buffers.image('gradient', 2 * depth, columns, np.float32).reshape(2, depth, columns)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     # An image of another width may have had the same padded one, and pixels where the padding is now.
     marks[:, MARGIN + width:] = 0
@@ -90,10 +88,10 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     return marks
 
 
-def kept_gradient(buffers: Buffers) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Components of the gradient of the last image, padded by PAD, where lines are refined."""
-    gx, gy = (buffers.last(name) for name in GRADIENT)
-    return gx, gy
+def kept_gradient(buffers: Buffers) -> NDArray[np.float32]:
+    """Components of the gradient of the last image along x and y, padded by PAD, where lines are refined: 2×H×W."""
+    gradient = buffers.last('gradient')
+    return gradient.reshape(2, -1, gradient.shape[1])
 
 
 def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float, float]:

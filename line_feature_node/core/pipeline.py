@@ -265,11 +265,10 @@ def _ridges(
 ) -> Ridges:
     """The gradient that edge extraction left, nothing where the mask is, with what is known of its noise."""
     height, width = shape
-    gx, gy = kept_gradient(buffers)
+    gradient = kept_gradient(buffers)
     if keep is not None:
-        for part in (gx, gy):
-            part[PAD:PAD + height, PAD:PAD + width][keep == 0] = 0
-    return Ridges(gx, gy, PAD, height, width, noise * gradient_noise(parameters), step_response(parameters),
+        gradient[:, PAD:PAD + height, PAD:PAD + width][:, keep == 0] = 0
+    return Ridges(gradient, PAD, height, width, noise * gradient_noise(parameters), step_response(parameters),
                   correlation_length(parameters))
 
 

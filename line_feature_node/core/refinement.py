@@ -71,6 +71,13 @@ SHORTEST, SHORTEST_GROWING = 9.0, 4.0
 HOPE = 0.4
 #: A line claims the pixels within this distance; a line of which more than this part is claimed is dropped.
 CLAIM, CLAIMED = 2.5, 0.6
+#: Between the centres of two pixels.
+HALF = 0.5
+#: What lies beyond this is no place in a picture.
+FARTHEST = 1e12
+#: How much the arc tangent of 1 is exceeded by the slope there: atan s = s (pi/4 + ARC (1 - s)) about (Rajan and others,
+#: 2006).
+ARC = 0.273
 #: Claims keep the direction of the gradient in so many steps of the full circle, with a bit that says that it is one.
 DIRECTIONS, IS_CLAIMED = 128, 128
 #: Claims count where the directions differ by at most so many steps, 25 degrees.
@@ -89,7 +96,7 @@ class Ridges(NamedTuple):
     """What refinement reads, besides the lines.
 
     Attributes:
-        gx, gy: Gradient, padded.
+        gradient: Its components along x and y, padded, one after the other: 2×rows×columns.
         pad: Its padding on each side.
         height, width: Of the picture.
         noise: Standard deviation of the noise of a component.
@@ -97,8 +104,7 @@ class Ridges(NamedTuple):
         correlation: Pixels along an edge whose noise counts as one.
     """
 
-    gx: NDArray[np.float32]
-    gy: NDArray[np.float32]
+    gradient: NDArray[np.float32]
     pad: int
     height: int
     width: int
@@ -122,19 +128,19 @@ def refine_lines(
     Returns:
         SEGMENT_DTYPE, strongest first guess first, a new array.
     """
-    gx, gy, pad, height, width, noise, step, correlation = ridges
-    flat_x, flat_y, stride = gx.reshape(-1), gy.reshape(-1), gx.shape[1]
+    gradient, pad, height, width, noise, step, correlation = ridges
+    flat, plane, stride = gradient.reshape(-1), gradient[0].size, gradient.shape[2]
     grown = buffers.array('ridges', count, RIDGE_DTYPE)[:count]
     strengths = buffers.array('strengths', count, np.float64)[:count]
-    lay(lines, flat_x, flat_y, stride, pad, height, width, grown, strengths)
+    lay(lines, flat, plane, stride, pad, height, width, grown, strengths)
     order = np.argsort(-strengths, kind='stable').astype(np.int32)
     claims = buffers.array('claims', height * width, np.uint8)[:height * width]
     values = buffers.array('responses', 2 * (height + width) + 4 * MEMORY, np.float64)
     counts = buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS]
-    count_norms(gx, gy, pad, height, width, counts)
+    count_norms(gradient, pad, height, width, counts)
     tests = 2 * math.log10(height * width)
     least = parameters.min_snr * noise, tests - math.log10(parameters.false_alarms)
-    grow(order, counts, least, flat_x, flat_y, stride, pad, height, width, noise, claims, values, grown)
+    grow(order, counts, least, flat, plane, stride, pad, height, width, noise, claims, values, grown)
     kept = judge(least, counts, order, grown)
     segments = np.empty(kept, SEGMENT_DTYPE)
     write(order, grown, step, correlation, tests, counts, segments)
@@ -144,60 +150,129 @@ def refine_lines(
 # Looking at a line
 
 @inlined
-def axes(steep: bool, stride: int, height: int, width: int) -> tuple[int, int, int, int]:
-    """Steps of a flat index along p and along q, and how many steps of each the picture has."""
+def axes(steep: bool, plane: int, stride: int, height: int, width: int) -> tuple[int, int, int, int, int, int]:
+    """How a line sees the gradient and the picture.
+
+    Returns:
+        Where the components along p and along q begin, in so many steps from those along x; what a step along p and
+        along q adds to an index; how many steps of p and of q the picture has.
+    """
     if steep:
-        return stride, 1, height, width
-    return 1, stride, width, height
+        return plane, 0, stride, 1, height, width
+    return 0, plane, 1, stride, width, height
 
 
 @inlined
-def across(gp: Any, gq: Any, index: int, np_: float, nq: float) -> float:
-    """The gradient across the line, at a pixel: its part along the normal."""
-    return np_ * gp[index] + nq * gq[index]
+def across(gradient: Any, along_p: int, along_q: int, np_: Any, nq: Any) -> Any:
+    """The gradient across a line at a pixel, its part along the normal, from where its components stand.
+
+    Indices are unsigned, for which Numba leaves out the test whether to count from the end.
+    """
+    return np_ * gradient[np.uint64(along_p)] + nq * gradient[np.uint64(along_q)]
 
 
 @inlined
-def normal_of(slope: float, sign: float) -> tuple[float, float]:
+def normal_of(slope: float, sign: float) -> tuple[Any, Any]:
     """The unit normal of a line that the gradient points along, its parts along p and q."""
     scale = sign / math.sqrt(1 + slope * slope)
-    return -slope * scale, scale
+    return np.float32(-slope * scale), np.float32(scale)
+
+
+@inlined
+def within(
+    slope: float, intercept: float, first: float, last: float, beyond: float, size_p: int, size_q: int,
+) -> tuple[int, int]:
+    """The first and the last whole p between two where a line is in the picture, or no farther than that beyond it.
+
+    Where it is nowhere, the last is less than the first; so it is for what is no number. By rounding the line may be
+    a little farther out there.
+    """
+    low, high = max(first, 0.0), min(last, size_p - 1.0)
+    least, most = -beyond, size_q - 1 + beyond
+    if not (abs(slope) < FARTHEST and abs(intercept) < FARTHEST):
+        high = -1.0
+    elif slope != 0:
+        at_least, at_most = (least - intercept) / slope, (most - intercept) / slope
+        low, high = max(low, min(at_least, at_most)), min(high, max(at_least, at_most))
+    elif not least <= intercept <= most:
+        high = -1.0
+    high = max(high, -1.0)
+    return math.ceil(min(low, high + 1)), math.floor(high)
 
 
 @kernel
 def mean_response(
-    line: Any, gp: Any, gq: Any, origin: int, step_p: int, step_q: int, size_p: int, size_q: int,
+    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int,
 ) -> float:
-    """The mean gradient across a line."""
-    np_, nq = normal_of(line['slope'], line['sign'])
-    total, count = 0.0, 0
-    for p in range(max(math.ceil(line['first']), 0), min(math.floor(line['last']), size_p - 1) + 1):
-        r = math.floor(line['slope'] * p + line['intercept'] + 0.5)
-        if 0 <= r < size_q:
-            total += across(gp, gq, origin + p * step_p + r * step_q, np_, nq)
-            count += 1
-    return total / max(count, 1)
+    """The mean gradient across a line, in the pixels along it; arguments as for :func:`align`."""
+    slope, intercept = line['slope'], line['intercept']
+    np_, nq = normal_of(slope, line['sign'])
+    low, high = within(slope, intercept, line['first'], line['last'], HALF, size_p, size_q)
+    total = 0.0
+    for p in range(low, high + 1):
+        index = p * step_p + math.floor(slope * p + intercept + HALF) * step_q
+        total += across(gradient, in_p + index, in_q + index, np_, nq)
+    return total / max(high - low + 1, 1)
 
+
+# Aligning
 
 @kernel
 def align(
-    line: Any, gp: Any, gq: Any, origin: int, step_p: int, step_q: int, size_p: int, size_q: int, move: float,
-    single: bool,
-) -> float:
-    """Shift and turn a line to where the gradient across it peaks.
+    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, move: float,
+) -> None:
+    """Shift and turn a line to about where the gradient across it peaks.
 
-    In each step of p the peak is that of the parabola through the gradient at three pixels across. In the noise a
-    single parabola may have none, so a first approach takes the mean curvature of all for each; then peaks that are no
-    farther than FARTHEST_PEAK count, each by its own.
+    In each step of p the peak would be that of the parabola through the gradient at three pixels across. In the noise
+    a single parabola may have none, so all have their mean curvature here.
 
     Args:
-        line: It is changed, and receives its mean response; with `single`, variance, size and moment of its peaks, too.
-        gp, gq: The gradient along p and q, flat.
-        origin: Index of the first pixel of the picture.
+        line: It is changed, and receives its mean response.
+        gradient: Its components along x and y, one after the other, flat.
+        in_p, in_q: Index of the components along p and q at the first pixel of the picture.
         step_p, step_q: What a step along p and q adds to an index.
         size_p, size_q: Pixels of the picture along p and q.
         move: The farthest that an end moves.
-        single: Whether each peak is that of its own parabola.
+    """
+    slope, intercept = line['slope'], line['intercept']
+    np_, nq = normal_of(slope, line['sign'])
+    trim = min(TRIM, LARGEST_TRIM * (line['last'] - line['first']))
+    low, high = within(slope, intercept, line['first'] + trim, line['last'] - trim, HALF, size_p, size_q)
+    n, middle = high - low + 1, 0.5 * (low + high)
+    if n < SHORTEST_GROWING:
+        return
+    response, curvature, slant, slant_t, sd, std = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for p in range(low, high + 1):
+        q = slope * p + intercept
+        r = math.floor(q + HALF)
+        index = p * step_p + r * step_q
+        before = across(gradient, in_p + index - step_q, in_q + index - step_q, np_, nq)
+        at = across(gradient, in_p + index, in_q + index, np_, nq)
+        behind = across(gradient, in_p + index + step_q, in_q + index + step_q, np_, nq)
+        t, d, first = p - middle, r - q, HALF * (behind - before)
+        response += at
+        curvature += behind + before - 2 * at
+        slant += first
+        slant_t += t * first
+        sd += d
+        std += t * d
+    line['response'] = response / n
+    curvature /= n
+    if curvature < -CURVED * line['response']:
+        turn = (std - slant_t / curvature) / (n * (n * n - 1.0) / 12)
+        nudge(line, (sd - slant / curvature) / n, turn, middle, move)
+
+
+@kernel
+def align_to_peaks(
+    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, move: float,
+) -> float:
+    """Shift and turn a line to the peaks of the gradient across it that are no farther than FARTHEST_PEAK.
+
+    Args:
+        line: It is changed, and receives its mean response, and variance, size and moment of the peaks, if there are
+            enough.
+        gradient, in_p, in_q, step_p, step_q, size_p, size_q, move: As for :func:`align`.
 
     Returns:
         How far its ends moved, q.
@@ -205,54 +280,40 @@ def align(
     slope, intercept = line['slope'], line['intercept']
     np_, nq = normal_of(slope, line['sign'])
     trim = min(TRIM, LARGEST_TRIM * (line['last'] - line['first']))
-    middle = 0.5 * (line['first'] + line['last'])
-    n, st, stt, sd, std, sdd = 0, 0.0, 0.0, 0.0, 0.0, 0.0
-    response, curvature, slant, slant_t = 0.0, 0.0, 0.0, 0.0
-    looked_at = 0
-    for p in range(max(math.ceil(line['first'] + trim), 0),
-                   min(math.floor(line['last'] - trim), size_p - 1) + 1):
+    low, high = within(slope, intercept, line['first'] + trim, line['last'] - trim, HALF, size_p, size_q)
+    middle = 0.5 * (low + high)
+    n, response, st, stt, sd, std, sdd = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for p in range(low, high + 1):
         q = slope * p + intercept
-        r = math.floor(q + 0.5)
-        if not 0 <= r < size_q:
-            continue
-        index = origin + p * step_p + r * step_q
-        before, at, behind = (across(gp, gq, index - step_q, np_, nq), across(gp, gq, index, np_, nq),
-                              across(gp, gq, index + step_q, np_, nq))
-        second, first = behind - 2 * at + before, 0.5 * (behind - before)
-        looked_at += 1
+        r = math.floor(q + HALF)
+        index = p * step_p + r * step_q
+        before = across(gradient, in_p + index - step_q, in_q + index - step_q, np_, nq)
+        at = across(gradient, in_p + index, in_q + index, np_, nq)
+        behind = across(gradient, in_p + index + step_q, in_q + index + step_q, np_, nq)
         response += at
-        curvature += second
-        t, d = p - middle, r - q
-        if single:
-            if not (second < 0 and abs(first) < -FARTHEST_PEAK * second):
-                continue
-            d -= first / second
-        else:
-            slant += first
-            slant_t += t * first
-        n += 1
-        st += t
-        stt += t * t
-        sd += d
-        std += t * d
-        sdd += d * d
+        first, second = HALF * (behind - before), behind + before - 2 * at
+        if abs(first) < -FARTHEST_PEAK * second:
+            t, d = p - middle, r - q - first / second
+            n += 1
+            st += t
+            stt += t * t
+            sd += d
+            std += t * d
+            sdd += d * d
     if n < SHORTEST_GROWING:
         return 0.0
-    line['response'] = response / looked_at
-    if not single:
-        curvature /= n
-        if curvature >= -CURVED * line['response']:
-            return 0.0
-        sd -= slant / curvature
-        std -= slant_t / curvature
     moment = stt - st * st / n
-    if moment <= 0:
-        return 0.0
     turn = (std - st * sd / n) / moment
     shift = (sd - turn * st) / n
-    if single:
-        line['variance'] = max(sdd - shift * sd - turn * std, 0.0) / max(n - 2, 1)
-        line['size'], line['moment'] = n, moment
+    line['response'] = response / (high - low + 1)
+    line['variance'] = max(sdd - shift * sd - turn * std, 0.0) / max(n - 2, 1)
+    line['size'], line['moment'] = n, moment
+    return nudge(line, shift, turn, middle, move)
+
+
+@inlined
+def nudge(line: Any, shift: float, turn: float, middle: float, move: float) -> float:
+    """Shift a line by so much, and turn it by so much about a place, as far as its ends may move; how far they did."""
     half = 0.5 * (line['last'] - line['first'])
     shift = min(max(shift, -move), move)
     turn = min(max(turn, -move / half), move / half)
@@ -261,37 +322,41 @@ def align(
     return abs(shift) + abs(turn) * half
 
 
+# Growing
+
 @inlined
-def support_at(
-    p: int, slope: float, intercept: float, gp: Any, gq: Any, origin: int, step_p: int, step_q: int, size_p: int,
-    size_q: int, np_: float, nq: float, tolerance: float,
+def support(
+    q: float, gradient: Any, along_p: int, along_q: int, step_q: int, np_: Any, nq: Any, tolerance: float,
 ) -> float:
-    """The gradient across a line, as far as it supports the line; 0 outside the picture.
+    """The gradient across a line at a place between two pixels, as far as it supports the line.
 
     It does not where it points elsewhere, or is stronger one pixel beside the line; what noise may do is tolerated.
+
+    Args:
+        q: The place.
+        gradient, along_p, along_q: The gradient, and where its components are for q = 0.
+        step_q: What a step along q adds to an index.
+        np_, nq: Normal of the line.
+        tolerance: What noise may do.
     """
-    q = slope * p + intercept
-    if not (0 <= p < size_p and 0 <= q <= size_q - 1):
-        return 0.0
-    r = min(int(q), size_q - 2)
-    part, index = q - r, origin + p * step_p + r * step_q
-    upper, lower = 1 - part, part
-    at_p = upper * gp[index] + lower * gp[index + step_q]
-    at_q = upper * gq[index] + lower * gq[index + step_q]
-    response = np_ * at_p + nq * at_q
-    tangential = abs(nq * at_p - np_ * at_q)
-    before = upper * across(gp, gq, index - step_q, np_, nq) + lower * across(gp, gq, index, np_, nq)
-    behind = upper * across(gp, gq, index + step_q, np_, nq) + lower * across(gp, gq, index + 2 * step_q, np_, nq)
-    if tangential > TANGENT * response + tolerance or max(before, behind) > response + tolerance:
-        return min(response, 0.0)
-    return response
+    r = int(q)
+    lower = np.float32(q - r)
+    upper = 1 - lower
+    index_p, index_q = along_p + r * step_q, along_q + r * step_q
+    p1, p2 = gradient[np.uint64(index_p)], gradient[np.uint64(index_p + step_q)]
+    q1, q2 = gradient[np.uint64(index_q)], gradient[np.uint64(index_q + step_q)]
+    first, second = np_ * p1 + nq * q1, np_ * p2 + nq * q2
+    response = upper * first + lower * second
+    before = upper * across(gradient, index_p - step_q, index_q - step_q, np_, nq) + lower * first
+    behind = upper * second + lower * across(gradient, index_p + 2 * step_q, index_q + 2 * step_q, np_, nq)
+    tangential = abs(nq * (upper * p1 + lower * p2) - np_ * (upper * q1 + lower * q2))
+    supports = (tangential <= TANGENT * response + tolerance) & (max(before, behind) <= response + tolerance)
+    return response if supports else min(response, np.float32(0))
 
-
-# Growing
 
 @kernel
 def extend(
-    line: Any, gp: Any, gq: Any, origin: int, step_p: int, step_q: int, size_p: int, size_q: int, noise: float,
+    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, noise: float,
     limit: float, at_first: bool, at_last: bool, values: Any,
 ) -> None:
     """Move the ends of a line to where the gradient across it ends; arguments as for :func:`align`.
@@ -307,63 +372,67 @@ def extend(
     half = int(min(WINDOW + WINDOW_NOISE * (noise / response)**2, LARGEST_WINDOW)) // 2
     first, last = line['first'], line['last']
     if at_last:
-        line['last'] = end_of(line, 1, last, first, half, gp, gq, origin, step_p, step_q, size_p, size_q,
+        line['last'] = end_of(line, 1, last, first, half, gradient, in_p, in_q, step_p, step_q, size_p, size_q,
                               TOLERANCE * noise, limit, values)
     if at_first:
-        line['first'] = -end_of(line, -1, -first, -last, half, gp, gq, origin, step_p, step_q, size_p, size_q,
+        line['first'] = -end_of(line, -1, -first, -last, half, gradient, in_p, in_q, step_p, step_q, size_p, size_q,
                                 TOLERANCE * noise, limit, values)
 
 
 @kernel
 def end_of(
-    line: Any, way: int, end: float, other: float, half: int, gp: Any, gq: Any, origin: int, step_p: int, step_q: int,
-    size_p: int, size_q: int, tolerance: float, limit: float, values: Any,
+    line: Any, way: int, end: float, other: float, half: int, gradient: Any, in_p: int, in_q: int, step_p: int,
+    step_q: int, size_p: int, size_q: int, tolerance: float, limit: float, values: Any,
 ) -> float:
     """Where a line ends on one side, in steps of p outwards; `way` is 1 where these are p itself, and -1 for -p.
 
     From a place inside it goes outwards step by step, until the mean over a window around the place is below END of the
     response: that of the line, and farther out that of about the last MEMORY steps. Between two steps the end is
-    interpolated.
+    interpolated. Outside the picture nothing supports a line, and no line ends.
     """
     slope, intercept, before = line['slope'], line['intercept'], line['response']
     np_, nq = normal_of(slope, line['sign'])
+    low, high = within(slope, intercept, 0.0, size_p - 1.0, 0.0, size_p, size_q)
+    nearest, farthest = (low, high) if way == 1 else (-high, -low)
     place = math.floor(end - min(half + INSIDE, 0.5 * (end - other)))
-    base = place - half
-    window = 0.0
-    for step in range(base, place + half + 1):
-        values[step - base] = support_at(way * step, slope, intercept, gp, gq, origin, step_p, step_q, size_p, size_q,
-                                         np_, nq, tolerance)
-        window += values[step - base]
-    size = 2 * half + 1
-    earlier = 2 * END * before
-    start = place
+    start, base, size = place, place - half, 2 * half + 1
+    window, earlier, found = 0.0, 2 * END * before, float(place)
+    step = base
     while True:
+        value = 0.0
+        if nearest <= step <= farthest:
+            p = way * step
+            value = support(slope * p + intercept, gradient, in_p + p * step_p, in_q + p * step_p, step_q, np_, nq,
+                            tolerance)
+        values[step - base] = value
+        window += value
+        step += 1
+        if step <= place + half:
+            continue
         mean = window / size
         if mean < END * before:
-            if place == start:
-                return float(place)
-            return place - 1 + (earlier - END * before) / (earlier - mean)
+            found = place - 1 + (earlier - END * before) / (earlier - mean) if place > start else float(place)
+            break
         if place >= end + limit:
-            return end + limit
-        p = way * (place + 1)
-        q = slope * p + intercept
-        if not (0 <= p < size_p and 0 <= q <= size_q - 1):
-            return float(place)
+            found = end + limit
+            break
+        if place + 1 > farthest or place + 1 < nearest:
+            found = float(place)
+            break
         if place > end:
             before += (min(max(values[place - base], 0.0), 2 * before) - before) / MEMORY
         earlier = mean
         window -= values[place - half - base]
         place += 1
-        values[place + half - base] = support_at(
-            way * (place + half), slope, intercept, gp, gq, origin, step_p, step_q, size_p, size_q, np_, nq, tolerance)
-        window += values[place + half - base]
+    return found
 
 
 @kernel
 def lay(
-    lines: Any, gx: Any, gy: Any, stride: int, pad: int, height: int, width: int, grown: Any, strengths: Any,
+    lines: Any, gradient: Any, plane: int, stride: int, pad: int, height: int, width: int, grown: Any, strengths: Any,
 ) -> None:
     """Turn first guesses into lines along their major axis, and tell how strong the gradient is along them."""
+    origin = pad * (stride + 1)
     for k in range(grown.size):
         guess, line = lines[k], grown[k]
         steep = abs(guess['sin']) > guess['cos']
@@ -377,9 +446,8 @@ def lay(
             line['intercept'] = guess['y'] - line['slope'] * guess['x']
             line['first'], line['last'] = min(guess['x1'], guess['x2']), max(guess['x1'], guess['x2'])
         line['sign'] = 1.0
-        step_p, step_q, size_p, size_q = axes(steep, stride, height, width)
-        gp, gq = (gy, gx) if steep else (gx, gy)
-        response = mean_response(line, gp, gq, pad * (stride + 1), step_p, step_q, size_p, size_q)
+        in_p, in_q, step_p, step_q, size_p, size_q = axes(steep, plane, stride, height, width)
+        response = mean_response(line, gradient, origin + in_p, origin + in_q, step_p, step_q, size_p, size_q)
         if response < 0:
             line['sign'], response = -1.0, -response
         line['response'] = response
@@ -389,7 +457,7 @@ def lay(
 
 @kernel
 def grow(
-    order: Any, counts: Any, least: tuple[float, float], gx: Any, gy: Any, stride: int, pad: int, height: int,
+    order: Any, counts: Any, least: tuple[float, float], gradient: Any, plane: int, stride: int, pad: int, height: int,
     width: int, noise: float, claims: Any, values: Any, grown: Any,
 ) -> None:
     """Let the lines that may become clear enough grow, in their order; those alive at the end are there once."""
@@ -402,37 +470,62 @@ def grow(
             continue
         if claimed(line, claims, height, width) > CLAIMED:
             continue
-        step_p, step_q, size_p, size_q = axes(line['steep'], stride, height, width)
-        gp, gq = (gy, gx) if line['steep'] else (gx, gy)
-        at_first = at_last = True
-        for turn in range(ROUNDS):
-            first, last = line['first'], line['last']
-            align(line, gp, gq, origin, step_p, step_q, size_p, size_q, MOVE, False)
-            limit = max(last - first, STEP) if turn < ROUNDS - 1 else UNBOUNDED
-            extend(line, gp, gq, origin, step_p, step_q, size_p, size_q, noise, limit, at_first, at_last, values)
-            # An end that stayed about where it was is one; the other is looked for anew, along a better line.
-            at_first, at_last = first - line['first'] > STAYS, line['last'] - last > STAYS
-            if not (at_first or at_last) or line['last'] - line['first'] < GROWS * (last - first):
-                break
-        if line['last'] - line['first'] < SHORTEST_GROWING:
-            continue
+        in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], plane, stride, height, width)
+        in_p, in_q = origin + in_p, origin + in_q
+        grow_line(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
         line['size'] = 0
-        # From where the first leaves the line, other peaks may be near enough.
-        if align(line, gp, gq, origin, step_p, step_q, size_p, size_q, LAST_MOVE, True) > SETTLED:
-            align(line, gp, gq, origin, step_p, step_q, size_p, size_q, LAST_MOVE, True)
-            extend(line, gp, gq, origin, step_p, step_q, size_p, size_q, noise, 0.0, True, True, values)
+        if line['last'] - line['first'] >= SHORTEST_GROWING:
+            settle(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
         if line['size'] > 0 and claimed(line, claims, height, width) <= CLAIMED:
             line['alive'] = True
             claim(line, claims, height, width)
+
+
+@kernel
+def grow_line(
+    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, noise: float,
+    values: Any,
+) -> None:
+    """Align a line and move its ends by turns; arguments as for :func:`extend`."""
+    at_first = at_last = True
+    for turn in range(ROUNDS):
+        first, last = line['first'], line['last']
+        align(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, MOVE)
+        limit = max(last - first, STEP) if turn < ROUNDS - 1 else UNBOUNDED
+        extend(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, limit, at_first, at_last, values)
+        # An end that stayed about where it was is one; the other is looked for anew, along a better line.
+        at_first, at_last = first - line['first'] > STAYS, line['last'] - last > STAYS
+        if not (at_first or at_last) or line['last'] - line['first'] < GROWS * (last - first):
+            break
+
+
+@kernel
+def settle(
+    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, noise: float,
+    values: Any,
+) -> None:
+    """Align a line to single peaks; arguments as for :func:`extend`."""
+    moved = align_to_peaks(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, LAST_MOVE)
+    if moved > SETTLED:  # other peaks may be near enough now
+        align_to_peaks(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, LAST_MOVE)
+        extend(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, 0.0, True, True, values)
 
 
 # Claims
 
 @inlined
 def direction_of(line: Any) -> int:
-    """The direction of the gradient across a line, in DIRECTIONS steps of the full circle."""
-    np_, nq = normal_of(line['slope'], line['sign'])
-    angle = math.atan2(np_, nq) if line['steep'] else math.atan2(nq, np_)
+    """The direction of the gradient across a line, in DIRECTIONS steps of the full circle.
+
+    The slope is its tangent, or cotangent, and 1 at most but for what alignment turned: a parabola has the angle within
+    a quarter of a degree.
+    """
+    slope = line['slope']
+    angle = slope * (math.pi / 4 + ARC * (1 - abs(slope)))
+    if line['steep']:
+        angle = (0.0 if line['sign'] > 0 else math.pi) - angle
+    else:
+        angle += math.copysign(math.pi / 2, line['sign'])
     return math.floor(angle * DIRECTIONS / (2 * math.pi) + 0.5) & DIRECTIONS - 1
 
 
@@ -440,30 +533,32 @@ def direction_of(line: Any) -> int:
 def claimed(line: Any, claims: Any, height: int, width: int) -> float:
     """The share of a line whose pixels others claim that run in the same direction."""
     own = direction_of(line)
-    step_p, step_q, size_p, size_q = axes(line['steep'], width, height, width)
-    hits, count = 0, 0
-    for p in range(max(math.ceil(line['first']), 0), min(math.floor(line['last']), size_p - 1) + 1):
-        r = math.floor(line['slope'] * p + line['intercept'] + 0.5)
-        if 0 <= r < size_q:
-            count += 1
-            found = claims[p * step_p + r * step_q]
-            if found & IS_CLAIMED:
-                turned = (np.int64(found) - own) & DIRECTIONS - 1
-                hits += turned <= SAME_DIRECTION or turned >= DIRECTIONS - SAME_DIRECTION
-    return hits / max(count, 1)
+    slope, intercept = line['slope'], line['intercept']
+    _, _, step_p, step_q, size_p, size_q = axes(line['steep'], 0, width, height, width)
+    low, high = within(slope, intercept, line['first'], line['last'], HALF, size_p, size_q)
+    hits = 0
+    for p in range(low, high + 1):
+        r = min(max(math.floor(slope * p + intercept + HALF), 0), size_q - 1)
+        found = np.int64(claims[np.uint64(p * step_p + r * step_q)])
+        turned = (found - own + SAME_DIRECTION) & DIRECTIONS - 1
+        hits += (found >= IS_CLAIMED) & (turned <= 2 * SAME_DIRECTION)
+    return hits / max(high - low + 1, 1)
 
 
 @kernel
 def claim(line: Any, claims: Any, height: int, width: int) -> None:
     """Claim the pixels near a line that nobody has claimed."""
     mark = np.uint8(direction_of(line) | IS_CLAIMED)
-    step_p, step_q, size_p, size_q = axes(line['steep'], width, height, width)
-    reach = CLAIM * math.sqrt(1 + line['slope'] * line['slope'])
-    for p in range(max(math.ceil(line['first']), 0), min(math.floor(line['last']), size_p - 1) + 1):
-        q = line['slope'] * p + line['intercept']
+    slope, intercept = line['slope'], line['intercept']
+    _, _, step_p, step_q, size_p, size_q = axes(line['steep'], 0, width, height, width)
+    reach = CLAIM * math.sqrt(1 + slope * slope)
+    low, high = within(slope, intercept, line['first'], line['last'], reach, size_p, size_q)
+    for p in range(low, high + 1):
+        q = slope * p + intercept
         for r in range(max(math.ceil(q - reach), 0), min(math.floor(q + reach), size_q - 1) + 1):
-            if claims[p * step_p + r * step_q] == 0:
-                claims[p * step_p + r * step_q] = mark
+            index = np.uint64(p * step_p + r * step_q)
+            found = claims[index]
+            claims[index] = found if found else mark
 
 
 # Judging
@@ -488,10 +583,11 @@ def rarity(response: float, counts: Any) -> float:
 
 
 @kernel
-def count_norms(gx: Any, gy: Any, pad: int, height: int, width: int, counts: Any) -> None:
+def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -> None:
     """Count how many of the pixels that are looked at have a norm of each bin, or a larger one."""
     for k in range(counts.size):
         counts[k] = 0
+    gx, gy = gradient[0], gradient[1]
     for row in range(pad, height + pad, COUNT_ROWS):
         for column in range(pad, width + pad, COUNT_COLUMNS):
             norm = math.sqrt(gx[row, column] * gx[row, column] + gy[row, column] * gy[row, column])

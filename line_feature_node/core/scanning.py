@@ -221,21 +221,19 @@ def walk(
 ) -> tuple[int, int]:
     """Append the pixels that follow the start in a direction, and put those beside which others stay on the stack."""
     pixel = start
-    state = 2 * direction
-    while True:
-        mask = open_neighbours(marks, pixel, stride)
-        following = table[state, mask]
-        if pixel != start and ((mask & (mask - 1)) != 0 or (following == END and mask != 0)):
-            stack[top] = pixel
-            top += 1
-        if following == END:
-            break
+    following = table[2 * direction, open_neighbours(marks, pixel, stride)]
+    while following != END:
         state = following
         pixel += steps[state]
         pixels[length] = pixel
         codes[length] = marks[pixel] & CODE
         marks[pixel] = TAKEN
         length += 1
+        mask = open_neighbours(marks, pixel, stride)
+        following = table[state, mask]
+        if (mask & (mask - 1)) != 0 or (following == END and mask != 0):
+            stack[top] = pixel
+            top += 1
     return length, top
 
 
