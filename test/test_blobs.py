@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -52,14 +53,15 @@ ORDERS = [raster, backwards, columns, shuffled, chains]
 
 def extract(
     image: NDArray[np.uint8], order: Callable[[NDArray[np.uint8]], Pixels] = raster, margin: int = 1,
-    buffers: Buffers | None = None,
+    buffers: Buffers | None = None, filled: NDArray[np.bool_] | None = None,
 ) -> tuple[Blobs, Pixels]:
     """The blobs of a quintuple image, given as a list of pixels in some order; and that list, rows and columns."""
     pixels = order(image)
     shape = image.shape[0] + 2 * margin, image.shape[1] + 2 * margin
     flat = (pixels[:, 0] + margin) * shape[1] + pixels[:, 1] + margin
     codes = image[pixels[:, 0], pixels[:, 1]]
-    return extract_blobs(flat.astype(np.int32), codes, shape, margin, buffers or Buffers()), pixels
+    bridged = np.zeros(len(flat), np.bool_) if filled is None else filled
+    return extract_blobs(flat.astype(np.int32), codes, bridged, shape, margin, buffers or Buffers()), pixels
 
 
 def listed(blobs: Blobs, pixels: Pixels) -> list[Blob]:
@@ -155,6 +157,20 @@ def test_members_are_a_partition(order: Callable[[NDArray[np.uint8]], Pixels]) -
     assert blobs.offsets[0] == 0
     assert blobs.offsets[-1] == len(pixels)
     np.testing.assert_array_equal(np.diff(blobs.offsets), blobs.attributes['size'])
+
+
+@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('margin', [1, 3])
+def test_moments(order: Callable[[NDArray[np.uint8]], Pixels], margin: int) -> None:
+    """Pixels that fill a gap do not count."""
+    rng = np.random.default_rng(5)
+    image = rng.choice(np.array([0, 1, 1, 1, 2], np.uint8), (40, 60))
+    filled = rng.random(int((image > 0).sum())) < 0.2
+    blobs, pixels = extract(image, order, margin, filled=filled)
+    for label, (first, last) in enumerate(pairwise(blobs.offsets)):
+        members = blobs.members[first:last]
+        y, x = pixels[members[~filled[members]]].T
+        assert blobs.moments[label].tolist() == [len(x), x.sum(), y.sum(), (x * x).sum(), (x * y).sum(), (y * y).sum()]
 
 
 def test_labels_that_merged_are_empty() -> None:

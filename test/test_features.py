@@ -1,4 +1,5 @@
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,13 +19,21 @@ Pixel = tuple[int, int]
 LARGE = (4000, 4000)
 
 
+def moments_of(
+    pixels: NDArray[np.integer], offsets: NDArray[np.integer], filled: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Sums of 1, x, y, x^2, x y and y^2 over the pixels (x, y) of each blob, but for those that fill a gap."""
+    x, y = pixels.T.astype(float)
+    parts = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], -1) * ~filled[:, None]
+    return np.array([parts[first:last].sum(0) for first, last in pairwise(offsets)]).reshape(-1, 6)
+
+
 def segments(
     blobs: list[list[Pixel]], shape: tuple[int, int] = LARGE, codes: list[int] | None = None,
-    bridged: set[Pixel] = frozenset(), margin: int = 1, **parameters: Any,
+    bridged: set[Pixel] = frozenset(), **parameters: Any,
 ) -> NDArray[np.void]:
     """The segments of line-blobs, each given as its pixels (x, y)."""
     pixels = np.array([pixel for blob in blobs for pixel in blob], np.int64).reshape(-1, 2)
-    stride = shape[1] + 2 * margin
     attributes = np.zeros(len(blobs), BLOB_DTYPE)
     for k, blob in enumerate(blobs):
         x, y = zip(*blob, strict=True)
@@ -32,9 +41,8 @@ def segments(
     offsets = np.cumsum([0] + [len(blob) for blob in blobs]).astype(np.int32)
     filled = np.array([tuple(pixel) in bridged for pixel in pixels.tolist()], np.bool_)
     lines, count = compute_lines(
-        Blobs(attributes, np.arange(len(pixels), dtype=np.int32), offsets),
-        ((pixels[:, 1] + margin) * stride + pixels[:, 0] + margin).astype(np.int32), filled, stride, margin, shape,
-        Parameters(**{'min_size': 2, **parameters}), Buffers())
+        Blobs(attributes, np.arange(len(pixels), dtype=np.int32), offsets, moments_of(pixels, offsets, filled)),
+        shape, Parameters(**{'min_size': 2, **parameters}), Buffers())
     assert lines.size >= 2 * count
     return segments_of(lines, np.ones(count, np.bool_))
 
@@ -308,10 +316,10 @@ def test_min_size(size: int, min_size: int, count: int) -> None:
 def test_labels_not_in_use_give_nothing() -> None:
     attributes = np.zeros(2, BLOB_DTYPE)
     attributes[1] = (3, 6, 4, 4, 10, 15, True)
-    pixels = (5 * 40 + np.arange(11, 17)).astype(np.int32)
+    pixels, offsets = np.array([(x, 4) for x in range(10, 16)]), np.array([0, 0, 6], np.int32)
     lines, count = compute_lines(
-        Blobs(attributes, np.arange(6, dtype=np.int32), np.array([0, 0, 6], np.int32)), pixels, np.zeros(6, np.bool_),
-        40, 1, (20, 38), Parameters(), Buffers())
+        Blobs(attributes, np.arange(6, dtype=np.int32), offsets, moments_of(pixels, offsets, np.zeros(6, np.bool_))),
+        (20, 38), Parameters(), Buffers())
     assert count == 1
     assert ends(segments_of(lines, np.ones(1, np.bool_))[0]) == [10, 4, 15, 4]
 
@@ -332,12 +340,6 @@ def test_bridged_pixels_do_not_bend_the_line() -> None:
     bulge = [(20, 21), (21, 21)]
     assert segment([*left, *bulge, *right], bridged=set(bulge))['theta'] == 0
     assert segment([*left, *bulge, *right])['theta'] != 0
-
-
-@pytest.mark.parametrize('margin', [1, 2, 5])
-def test_margin_is_no_part_of_the_image(margin: int) -> None:
-    blob = line((2, 1))
-    assert segment(blob, margin=margin).tobytes() == segment(blob).tobytes()
 
 
 @pytest.mark.parametrize('code', [1, 2, 3, 4])

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from test_features import moments_of
 
 from line_feature_node.core.blobs import BLOB_DTYPE, Blobs
 from line_feature_node.core.buffers import Buffers
@@ -44,11 +45,10 @@ def computed(
     attributes: NDArray[np.void], pixels: NDArray[np.int64], offsets: NDArray[np.int32], shape: tuple[int, int],
     **parameters: Any,
 ) -> tuple[NDArray[np.void], int]:
-    stride = shape[1] + 2
+    moments = moments_of(pixels, offsets, np.zeros(len(pixels), np.bool_))
     return compute_lines(
-        Blobs(attributes, np.arange(len(pixels), dtype=np.int32), offsets),
-        ((pixels[:, 1] + 1) * stride + pixels[:, 0] + 1).astype(np.int32), np.zeros(len(pixels), np.bool_), stride, 1,
-        shape, Parameters(**{'min_size': 2, **parameters}), Buffers())
+        Blobs(attributes, np.arange(len(pixels), dtype=np.int32), offsets, moments), shape,
+        Parameters(**{'min_size': 2, **parameters}), Buffers())
 
 
 def line(*ends: int) -> Any:

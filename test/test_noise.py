@@ -49,8 +49,9 @@ def kept(image: Image, parameters: Parameters) -> tuple[Image, Image]:
     buffers = Buffers()
     extract_edges(np.ascontiguousarray(image), parameters, buffers)
     inside = slice(PAD, PAD + image.shape[0]), slice(PAD, PAD + image.shape[1])
-    gx, gy = kept_gradient(buffers)
-    return gx[inside].astype(np.float64), gy[inside].astype(np.float64)
+    values, quantum = kept_gradient(buffers)
+    gx, gy = np.moveaxis(values[inside] * quantum, 2, 0)
+    return gx, gy
 
 
 # What is measured

@@ -17,6 +17,10 @@ BLOB_DTYPE = np.dtype([
 ])
 
 
+#: Sums of 1, x, y, x^2, x y and y^2 over the pixels of a blob: all that its line is computed from, (A.1) and (A.3).
+MOMENTS = 6
+
+
 class Blobs(NamedTuple):
     """Line-blobs. The arrays are the extractor's own: a frame's blobs end with the next frame.
 
@@ -25,21 +29,25 @@ class Blobs(NamedTuple):
         members: int32, for each blob its pixels, as indices into the list of edge pixels, one blob after the other:
             the linked NODEs of Fig. 13 as one array.
         offsets: int32, where each blob's members start; one more than there are labels.
+        moments: N×MOMENTS float64, whole numbers: of each blob, without pixels that fill a gap.
     """
 
     attributes: NDArray[np.void]
     members: NDArray[np.int32]
     offsets: NDArray[np.int32]
+    moments: NDArray[np.float64]
 
 
 def extract_blobs(
-    pixels: NDArray[np.int32], codes: NDArray[np.uint8], shape: tuple[int, int], margin: int, buffers: Buffers,
+    pixels: NDArray[np.int32], codes: NDArray[np.uint8], bridged: NDArray[np.bool_], shape: tuple[int, int],
+    margin: int, buffers: Buffers,
 ) -> Blobs:
     """Group 8-connected edge pixels of one code.
 
     Args:
         pixels: Flat index of each edge pixel in the padded image; no pixel twice.
         codes: Code of each, 1 to 4: the quintuple image as the list of what is not background.
+        bridged: Whether each fills a gap.
         shape: Rows and columns of the padded image.
         margin: Its padding on each side, one pixel at least.
         buffers: Memory to work in.
@@ -52,8 +60,10 @@ def extract_blobs(
     attributes = buffers.array('blobs', used, BLOB_DTYPE)[:used]
     members = buffers.array('members', most, np.int32)[:most]
     offsets = buffers.array('blob offsets', used + 1, np.int32)[:used + 1]
+    moments = buffers.array('moments', MOMENTS * used, np.float64)[:MOMENTS * used].reshape(used, MOMENTS)
     collect(pixels, codes, stride, margin, labels, parents, attributes, members, offsets)
-    return Blobs(attributes, members, offsets)
+    sum_up(pixels, bridged, stride, margin, members, offsets, moments)
+    return Blobs(attributes, members, offsets, moments)
 
 
 @inlined
@@ -143,3 +153,27 @@ def include(blob: Any, code: int, row: int, column: int) -> None:
     blob['max_row'] = max(blob['max_row'], row)
     blob['min_col'] = min(blob['min_col'], column)
     blob['max_col'] = max(blob['max_col'], column)
+
+
+@kernel
+def sum_up(
+    pixels: Any, bridged: Any, stride: int, margin: int, members: Any, offsets: Any, moments: Any,
+) -> None:
+    """The moments of each blob."""
+    inverse = 1 / stride
+    for label in range(moments.shape[0]):
+        n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
+        for place in range(offsets[label], offsets[label + 1]):
+            k = members[place]
+            row, column = position(pixels[k], inverse, stride)
+            counts = 0 if bridged[k] else 1
+            x, y = counts * (column - margin), counts * (row - margin)
+            n, sx, sy, sxx, sxy, syy = n + counts, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
+        put_down(moments, label, n, sx, sy, sxx, sxy, syy)
+
+
+@inlined
+def put_down(moments: Any, place: int, n: int, sx: int, sy: int, sxx: int, sxy: int, syy: int) -> None:
+    """Put sums in their place."""
+    moments[place, 0], moments[place, 1], moments[place, 2] = n, sx, sy
+    moments[place, 3], moments[place, 4], moments[place, 5] = sxx, sxy, syy

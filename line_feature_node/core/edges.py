@@ -10,7 +10,7 @@ All arrays of a frame are padded: the planes by two replicated rows and columns 
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -38,6 +38,11 @@ ONE = np.float32(1)
 NO_MARK, CODE_1, CODE_2, CODE_3, CODE_4, STRONG_MARK = (np.uint8(mark) for mark in (0, 1, 2, 3, 4, STRONG))
 #: Half a section of the gradient space is 22.5 degrees.
 SECTION = np.float32(math.tan(math.pi / 8))
+#: White, where parameters do not say it, by the kind and the bytes of pixels.
+WHITE = {('u', 1): 255.0, ('u', 2): 65535.0, ('f', 4): 255.0}
+#: The largest number that the gradient is kept as, and the steepest gradient that is told from others: 32 times what
+#: black and white make it in the nominal range.
+LARGEST, STEEPEST = 32767, 8192.0
 #: Added to every pixel: the recursion would fade into denormal numbers, which are slow, beside a black area.
 PEDESTAL = 1.0
 
@@ -61,10 +66,8 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     # Whole strips of rows and whole tiles of columns fit in, with the padding.
     lines, columns = -(-height // LANES) * LANES, -(-(width + 2 * PAD) // TILE) * TILE
     plane = buffers.image('plane', lines + 2 * PAD, columns, np.float32)
-    rows = buffers.image('rows', 9, columns, np.float32)
-    # Refinement looks at the gradient; without, only three rows are needed at a time.
-    depth = lines + 2 * PAD if parameters.refine else 3
-    gx, gy = buffers.image('gradient', 2 * depth, columns, np.float32).reshape(2, depth, columns)
+    rows = buffers.image('rows', 15, columns, np.float32)
+    kept = buffers.image('gradient', lines + 2 * PAD if parameters.refine else 0, 2 * columns, np.int16)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     # An image of another width may have had the same padded one, and pixels where the padding is now.
     marks[:, MARGIN + width:] = 0
@@ -83,15 +86,35 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
         inside = slice(height + 2 * PAD), slice(width + 2 * PAD)
         cv2.GaussianBlur(plane[inside], (0, 0), parameters.sigma, dst=smoothed[inside], borderType=cv2.BORDER_REPLICATE)
         plane = smoothed
+    quantum = buffers.array('quantum', 1, np.float64)
+    quantum[0] = _quantum(image, scale) if parameters.refine else 1.0
     sweep(height, width, recursive, q, side, centre, parameters.T1, parameters.T2,
-          parameters.thinning == 'suppression', plane, rows, gx, gy, marks)
+          parameters.thinning == 'suppression', plane, rows, 1 / quantum[0], kept, marks)
     return marks
 
 
-def kept_gradient(buffers: Buffers) -> NDArray[np.float32]:
-    """Components of the gradient of the last image along x and y, padded by PAD, where lines are refined: 2×H×W."""
-    gradient = buffers.last('gradient')
-    return gradient.reshape(2, -1, gradient.shape[1])
+class Gradient(NamedTuple):
+    """The gradient of an image, in whole multiples of a quantum: half the memory of floats, and as much of the cache.
+
+    Attributes:
+        values: Components along x and y, H×W×2 int16, padded by PAD.
+        quantum: What they are multiples of, in grey levels a pixel.
+    """
+
+    values: NDArray[np.int16]
+    quantum: float
+
+
+def kept_gradient(buffers: Buffers) -> Gradient:
+    """The gradient of the last image, where lines are refined."""
+    values = buffers.last('gradient')
+    return Gradient(values.reshape(values.shape[0], -1, 2), float(buffers.last('quantum')[0]))
+
+
+def _quantum(image: NDArray[Any], scale: float) -> float:
+    """What the gradient is kept in multiples of: the finest that has room for the grey levels of the image."""
+    low, high = (0.0, 255.0) if image.dtype == np.uint8 else cv2.minMaxLoc(image)[:2]
+    return min(max(abs(scale) * (high - low), 1.0), STEEPEST) / LARGEST
 
 
 def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float, float]:
@@ -103,7 +126,7 @@ def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float
     low, high = parameters.intensity_min, parameters.intensity_max
     low = 0.0 if math.isnan(low) else low
     if math.isnan(high):
-        high = float(np.iinfo(dtype).max) if dtype.kind == 'u' else 255.0
+        high = WHITE[dtype.kind, dtype.itemsize]
     if low >= high:
         raise ValueError(f'intensity_min must be less than intensity_max, got {low:g} and {high:g} for {dtype} pixels')
     scale = 255.0 / (high - low)
@@ -269,17 +292,16 @@ def start_upwards(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
 @kernel
 def sweep(
     height: int, width: int, recursive: bool, q: float, side: float, centre: float, T1: float, T2: float, thin: bool,
-    plane: Any, rows: Any, gx: Any, gy: Any, marks: Any,
+    plane: Any, rows: Any, per_quantum: float, kept: Any, marks: Any,
 ) -> None:
     """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it.
 
-    The gradient goes into arrays of as many rows as the plane has, or of three that are used in turn. But for these
-    only a few rows are written besides the marks; to smooth the plane in place would push the marks out of the cache,
-    which are read next.
+    Three rows each of the smoothed image, of the gradient and of the norm are used in turn. The gradient is kept if
+    there is room. But for that only a few rows are written besides the marks; to smooth the plane in place would push
+    the marks out of the cache, which are read next.
     """
     b, a = np.float32(side), np.float32(centre)
-    across, along, norm, smooth = rows[1], rows[2], rows[3:6], rows[6:9]
-    depth = gx.shape[0]
+    across, along, norm, smooth, gx, gy = rows[1], rows[2], rows[3:6], rows[6:9], rows[9:12], rows[12:15]
     for row in (height + PAD, height + PAD + 1):
         copy_row(plane[row], smooth[row % 3])
     for row in range(height + PAD - 1, -1, -1):
@@ -289,10 +311,12 @@ def sweep(
         else:
             copy_row(plane[row], smooth[below])
         combine_columns(smooth[below], smooth[above], smooth[middle], b, a, across, along)
-        gradient(across, along, b, a, gx[(row + 1) % depth], gy[(row + 1) % depth], norm[above])
+        gradient(across, along, b, a, gx[above], gy[above], norm[above])
+        if kept.size > 0:
+            keep(gx[above], gy[above], np.float32(per_quantum), kept[row + 1])
         if row < height:
-            suppress(norm[above], norm[middle], norm[below], gx[(row + 2) % depth], gy[(row + 2) % depth],
-                     np.float32(T1), np.float32(T2), thin, marks[row + MARGIN, MARGIN:MARGIN + width])
+            suppress(norm[above], norm[middle], norm[below], gx[middle], gy[middle], np.float32(T1), np.float32(T2),
+                     thin, marks[row + MARGIN, MARGIN:MARGIN + width])
 
 
 @inlined
@@ -312,6 +336,15 @@ def gradient(across: Any, along: Any, side: Any, centre: Any, gx: Any, gy: Any, 
         gx[i] = x
         gy[i] = y
         norm[i] = np.sqrt(x * x + y * y)
+
+
+@inlined
+def keep(gx: Any, gy: Any, per_quantum: Any, kept: Any) -> None:
+    """Put down a row of the gradient in whole numbers, both components of a pixel beside each other."""
+    most = np.float32(LARGEST)
+    for i in range(gx.size):
+        kept[2 * i] = np.int16(np.rint(min(max(gx[i] * per_quantum, -most), most)))
+        kept[2 * i + 1] = np.int16(np.rint(min(max(gy[i] * per_quantum, -most), most)))
 
 
 @inlined

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from line_feature_node.core.blobs import Blobs
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
-from line_feature_node.core.indices import position
 from line_feature_node.core.parameters import Parameters
 
 #: One segment, as users get it and as the PointCloud2 message lays it out. Pixels and radians; the centre of the
@@ -50,15 +49,12 @@ VERTICAL = 1e-6
 
 
 def compute_lines(
-    blobs: Blobs, pixels: NDArray[np.int32], bridged: NDArray[np.bool_], stride: int, margin: int,
-    shape: tuple[int, int], parameters: Parameters, buffers: Buffers,
+    blobs: Blobs, shape: tuple[int, int], parameters: Parameters, buffers: Buffers,
 ) -> tuple[NDArray[np.void], int]:
     """Compute the line of each blob that has an orientation and min_size pixels; pixels that fill a gap don't count.
 
     Args:
         blobs: The line-blobs.
-        pixels, bridged: Flat index of each edge pixel in the padded image, and whether it fills a gap.
-        stride, margin: Length of a row of the padded image, and its padding.
         shape: Height and width of the image, to which end points are clipped.
         parameters: min_size and orientation are used.
         buffers: Memory to work in.
@@ -68,51 +64,30 @@ def compute_lines(
     """
     lines = buffers.array('lines', 2 * blobs.attributes.size, LINE_DTYPE)
     height, width = shape
-    count = fit_blobs(blobs.attributes, blobs.members, blobs.offsets, pixels, bridged, stride, margin,
-                      parameters.min_size, parameters.orientation == 'least_squares', float(height), float(width),
-                      lines)
+    count = fit_blobs(blobs.attributes, blobs.moments, parameters.min_size, parameters.orientation == 'least_squares',
+                      float(height), float(width), lines)
     return lines, int(count)
 
 
 @kernel
 def fit_blobs(
-    blobs: Any, members: Any, offsets: Any, pixels: Any, bridged: Any, stride: int, margin: int, min_size: int,
-    least_squares: bool, height: float, width: float, lines: Any,
+    blobs: Any, moments: Any, min_size: int, least_squares: bool, height: float, width: float, lines: Any,
 ) -> int:
-    """Sum up the pixels of each blob and fit its line."""
+    """Fit the line of each blob."""
     count = 0
     for label in range(blobs.size):
         blob = blobs[label]
-        if not blob['select'] or blob['size'] < min_size:
+        if not blob['select'] or moments[label, 0] < min_size:
             continue
         line = lines[count]
-        sum_pixels(members[offsets[label]:offsets[label + 1]], pixels, bridged, stride, margin, line)
+        line['n'], line['sx'], line['sy'] = moments[label, 0], moments[label, 1], moments[label, 2]
+        line['sxx'], line['sxy'], line['syy'] = moments[label, 3], moments[label, 4], moments[label, 5]
         line['min_col'], line['max_col'] = blob['min_col'], blob['max_col']
         line['min_row'], line['max_row'] = blob['min_row'], blob['max_row']
         line['code'] = blob['dir']
-        if line['n'] >= min_size and fit(line, least_squares, height, width):
+        if fit(line, least_squares, height, width):
             count += 1
     return count
-
-
-@inlined
-def sum_pixels(members: Any, pixels: Any, bridged: Any, stride: int, margin: int, line: Any) -> None:
-    """The sums of (A.1) and (A.3); whole numbers, and so exact."""
-    inverse = 1 / stride
-    n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
-    for k in members:
-        if bridged[k]:
-            continue
-        row, column = position(pixels[k], inverse, stride)
-        x, y = column - margin, row - margin
-        n += 1
-        sx += x
-        sy += y
-        sxx += x * x
-        sxy += x * y
-        syy += y * y
-    line['n'], line['sx'], line['sy'] = n, sx, sy
-    line['sxx'], line['sxy'], line['syy'] = sxx, sxy, syy
 
 
 @inlined

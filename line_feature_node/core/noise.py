@@ -13,8 +13,8 @@ from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.edges import STENCILS, deriche_stencil, intensity_map
 from line_feature_node.core.parameters import Parameters
 
-#: The noise is measured in one of so many rows.
-EVERY = 16
+#: The noise is measured in this many rows, or a few more, and in one of at least so many.
+ROWS, EVERY = 30, 16
 #: Bins of the histogram that the median is taken from, and how many there are to a grey level.
 BINS, RESOLUTION = 8192, 4
 #: The median of |x| of a normal distribution, in standard deviations.
@@ -123,7 +123,8 @@ def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
     for k in range(BINS):
         counts[0, k], counts[1, k] = 0, 0
     total = 0
-    for row in range(min(1 + EVERY // 2, height // 2), height - 1, EVERY):
+    every = max(height // ROWS, EVERY)
+    for row in range(min(1 + every // 2, height // 2), height - 1, every):
         if row < 1:
             continue
         above, middle, below = image[row - 1], image[row], image[row + 1]

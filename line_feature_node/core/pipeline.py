@@ -239,13 +239,12 @@ class LineFeatureExtractor:
         normalize_codes(chains, p.n if by_codes else 0)
         watch('normalization', chains.codes)
         if by_codes:
-            blobs = extract_blobs(chains.pixels, chains.codes, marks.shape, MARGIN, buffers)
+            blobs = extract_blobs(chains.pixels, chains.codes, chains.bridged, marks.shape, MARGIN, buffers)
         else:
             variance = deviation_variance(noise * gradient_noise(p), p.T1)
             blobs = split_chains(chains, variance, marks.shape[1], MARGIN, p.min_size, buffers)
         watch('blobs', blobs)
-        lines, count = compute_lines(blobs, chains.pixels, chains.bridged, marks.shape[1], MARGIN, grey.shape, p,
-                                     buffers)
+        lines, count = compute_lines(blobs, grey.shape, p, buffers)
         watch('features', lines[:count])
         self.unlinked = count
         if p.refine:
@@ -265,11 +264,11 @@ def _ridges(
 ) -> Ridges:
     """The gradient that edge extraction left, nothing where the mask is, with what is known of its noise."""
     height, width = shape
-    gradient = kept_gradient(buffers)
+    gradient, quantum = kept_gradient(buffers)
     if keep is not None:
-        gradient[:, PAD:PAD + height, PAD:PAD + width][:, keep == 0] = 0
-    return Ridges(gradient, PAD, height, width, noise * gradient_noise(parameters), step_response(parameters),
-                  correlation_length(parameters))
+        gradient[PAD:PAD + height, PAD:PAD + width][keep == 0] = 0
+    return Ridges(gradient, PAD, height, width, noise * gradient_noise(parameters) / quantum,
+                  step_response(parameters) / quantum, correlation_length(parameters))
 
 
 def working_picture(

@@ -37,6 +37,9 @@ RIDGE_DTYPE = np.dtype([
 
 #: The gradient along a first guess is looked at in so many places, about.
 SAMPLES = 10
+#: For that, and to align it while it grows, one of at most SPARSEST steps of a line is looked at: of one longer than
+#: so many steps every second, and so on.
+ROUGH, SPARSEST = 16, 2
 #: Rounds of growing; in each but the last a line gets at most twice as long, and STEP at least at each end.
 ROUNDS, STEP = 3, 10.0
 #: What gets longer by less than this factor in a round has its length.
@@ -88,8 +91,8 @@ SAME_DIRECTION = 9
 INDEPENDENT = 0.8
 #: Peaks are known to a fiftieth of a pixel at best, in whole grey levels.
 LEAST_VARIANCE = 0.02**2
-#: Norms are counted in every so many rows and columns, in bins of a part of a grey level a pixel.
-COUNT_ROWS, COUNT_COLUMNS, NORM_BINS, NORM_RESOLUTION = 8, 2, 4096, 32
+#: Norms are counted in every so many rows and columns, in bins of so many units of the gradient.
+COUNT_ROWS, COUNT_COLUMNS, NORM_BINS, NORM_BIN = 8, 2, 4096, 4
 #: No gradient is rarer than this share of the pixels, as so many are looked at.
 RAREST = 1e-4
 
@@ -98,15 +101,15 @@ class Ridges(NamedTuple):
     """What refinement reads, besides the lines.
 
     Attributes:
-        gradient: Its components along x and y, padded, one after the other: 2×rows×columns.
+        gradient: H×W×2 int16, padded: its components along x and y, in whole numbers of some unit.
         pad: Its padding on each side.
         height, width: Of the picture.
-        noise: Standard deviation of the noise of a component.
-        step: The gradient of a step of one grey level.
+        noise: Standard deviation of the noise of a component, in that unit.
+        step: The gradient of a step of one grey level, in that unit.
         correlation: Pixels along an edge whose noise counts as one.
     """
 
-    gradient: NDArray[np.float32]
+    gradient: NDArray[np.int16]
     pad: int
     height: int
     width: int
@@ -131,10 +134,10 @@ def refine_lines(
         SEGMENT_DTYPE, strongest first guess first, a new array.
     """
     gradient, pad, height, width, noise, step, correlation = ridges
-    flat, plane, stride = gradient.reshape(-1), gradient[0].size, gradient.shape[2]
+    flat, stride = gradient.reshape(-1), 2 * gradient.shape[1]
     grown = buffers.array('ridges', count, RIDGE_DTYPE)[:count]
     strengths = buffers.array('strengths', count, np.float32)[:count]
-    lay(lines, flat, plane, stride, pad, height, width, grown, strengths)
+    lay(lines, flat, stride, pad, height, width, grown, strengths)
     # The first bits of floats are in their order, and sorted faster, by counting.
     order = np.argsort(~(strengths.view(np.uint32) >> 16).astype(np.uint16), kind='stable')
     claims = buffers.array('claims', height * width, np.uint8)[:-(-height // CELL) * -(-width // CELL)]
@@ -143,7 +146,7 @@ def refine_lines(
     count_norms(gradient, pad, height, width, counts)
     tests = 2 * math.log10(height * width)
     least = parameters.min_snr * noise, tests - math.log10(parameters.false_alarms)
-    grow(order, counts, least, flat, plane, stride, pad, height, width, noise, claims, values, grown)
+    grow(order, counts, least, flat, stride, pad, height, width, noise, claims, values, grown)
     kept = judge(least, counts, order, grown)
     segments = np.empty(kept, SEGMENT_DTYPE)
     write(order, grown, step, correlation, tests, counts, segments)
@@ -153,16 +156,16 @@ def refine_lines(
 # Looking at a line
 
 @inlined
-def axes(steep: bool, plane: int, stride: int, height: int, width: int) -> tuple[int, int, int, int, int, int]:
-    """How a line sees the gradient and the picture.
+def axes(steep: bool, origin: int, stride: int, height: int, width: int) -> tuple[int, int, int, int, int, int]:
+    """How a line sees the gradient, of which a pixel has two components beside each other, and the picture.
 
     Returns:
-        Where the components along p and along q begin, in so many steps from those along x; what a step along p and
-        along q adds to an index; how many steps of p and of q the picture has.
+        Where the components along p and along q of the first pixel are; what a step along p and along q adds to an
+        index; how many steps of p and of q the picture has.
     """
     if steep:
-        return plane, 0, stride, 1, height, width
-    return 0, plane, 1, stride, width, height
+        return origin + 1, origin, stride, 2, height, width
+    return origin, origin + 1, 2, stride, width, height
 
 
 @inlined
@@ -232,7 +235,7 @@ def align(
 
     Args:
         line: It is changed, and receives its mean response.
-        gradient: Its components along x and y, one after the other, flat.
+        gradient: Its components, flat, in whole numbers.
         in_p, in_q: Index of the components along p and q at the first pixel of the picture.
         step_p, step_q: What a step along p and q adds to an index.
         size_p, size_q: Pixels of the picture along p and q.
@@ -242,11 +245,14 @@ def align(
     np_, nq = normal_of(slope, line['sign'])
     trim = min(TRIM, LARGEST_TRIM * (line['last'] - line['first']))
     low, high = within(slope, intercept, line['first'] + trim, line['last'] - trim, HALF, size_p, size_q)
-    n, middle = high - low + 1, 0.5 * (low + high)
-    if n < SHORTEST_GROWING:
+    if high - low + 1 < SHORTEST_GROWING:
         return
+    stride = min(1 + (high - low) // ROUGH, SPARSEST)
+    n = (high - low) // stride + 1
+    low += (high - low) % stride // 2
+    middle = low + 0.5 * stride * (n - 1)
     response, curvature, slant, slant_t, sd, std = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for p in range(low, high + 1):
+    for p in range(low, high + 1, stride):
         q = slope * p + intercept
         r = math.floor(q + HALF)
         index = p * step_p + r * step_q
@@ -263,7 +269,7 @@ def align(
     line['response'] = response / n
     curvature /= n
     if curvature < -CURVED * line['response']:
-        turn = (std - slant_t / curvature) / (n * (n * n - 1.0) / 12)
+        turn = (std - slant_t / curvature) / (stride * stride * n * (n * n - 1.0) / 12)
         nudge(line, (sd - slant / curvature) / n, turn, middle, move)
 
 
@@ -433,10 +439,10 @@ def end_of(
 
 @kernel
 def lay(
-    lines: Any, gradient: Any, plane: int, stride: int, pad: int, height: int, width: int, grown: Any, strengths: Any,
+    lines: Any, gradient: Any, stride: int, pad: int, height: int, width: int, grown: Any, strengths: Any,
 ) -> None:
     """Turn first guesses into lines along their major axis, and tell how strong the gradient is along them."""
-    origin = pad * (stride + 1)
+    origin = pad * (stride + 2)
     for k in range(grown.size):
         guess, line = lines[k], grown[k]
         steep = abs(guess['sin']) > guess['cos']
@@ -450,8 +456,8 @@ def lay(
             line['intercept'] = guess['y'] - line['slope'] * guess['x']
             line['first'], line['last'] = min(guess['x1'], guess['x2']), max(guess['x1'], guess['x2'])
         line['sign'] = 1.0
-        in_p, in_q, step_p, step_q, size_p, size_q = axes(steep, plane, stride, height, width)
-        response = mean_response(line, gradient, origin + in_p, origin + in_q, step_p, step_q, size_p, size_q)
+        in_p, in_q, step_p, step_q, size_p, size_q = axes(steep, origin, stride, height, width)
+        response = mean_response(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q)
         if response < 0:
             line['sign'], response = -1.0, -response
         line['response'] = response
@@ -461,11 +467,11 @@ def lay(
 
 @kernel
 def grow(
-    order: Any, counts: Any, least: tuple[float, float], gradient: Any, plane: int, stride: int, pad: int, height: int,
+    order: Any, counts: Any, least: tuple[float, float], gradient: Any, stride: int, pad: int, height: int,
     width: int, noise: float, claims: Any, values: Any, grown: Any,
 ) -> None:
     """Let the lines that may become clear enough grow, in their order; those alive at the end are there once."""
-    origin = pad * (stride + 1)
+    origin = pad * (stride + 2)
     for k in range(claims.size):
         claims[k] = 0
     for k in order:
@@ -474,8 +480,7 @@ def grow(
             continue
         if claimed(line, claims, height, width) > CLAIMED:
             continue
-        in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], plane, stride, height, width)
-        in_p, in_q = origin + in_p, origin + in_q
+        in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], origin, stride, height, width)
         grow_line(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
         line['size'] = 0
         if line['last'] - line['first'] >= SHORTEST_GROWING:
@@ -585,7 +590,7 @@ def length_of(line: Any) -> float:
 @inlined
 def norm_bin(norm: float) -> int:
     """The bin of a norm; that of what is too large for all, or no number, is the last."""
-    return int(norm * NORM_RESOLUTION) if norm < (NORM_BINS - 1) / NORM_RESOLUTION else NORM_BINS - 1
+    return int(norm / NORM_BIN) if norm < NORM_BIN * (NORM_BINS - 1) else NORM_BINS - 1
 
 
 @inlined
@@ -600,11 +605,10 @@ def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -
     """Count how many of the pixels that are looked at have a norm of each bin, or a larger one."""
     for k in range(counts.size):
         counts[k] = 0
-    gx, gy = gradient[0], gradient[1]
     for row in range(pad, height + pad, COUNT_ROWS):
         for column in range(pad, width + pad, COUNT_COLUMNS):
-            norm = math.sqrt(gx[row, column] * gx[row, column] + gy[row, column] * gy[row, column])
-            counts[norm_bin(norm)] += 1
+            x, y = np.float32(gradient[row, column, 0]), np.float32(gradient[row, column, 1])
+            counts[norm_bin(math.sqrt(x * x + y * y))] += 1
     for k in range(counts.size - 2, -1, -1):
         counts[k] += counts[k + 1]
 

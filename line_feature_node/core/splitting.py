@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, clear, include
+from line_feature_node.core.blobs import BLOB_DTYPE, MOMENTS, Blobs, put_down
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.indices import position
@@ -56,17 +56,18 @@ def split_chains(
     attributes = buffers.array('stretches', most, BLOB_DTYPE)
     members = buffers.array('members', size, np.int32)
     offsets = buffers.array('blob offsets', most + 1, np.int32)
-    units = int(np.diff(chains.offsets).max(initial=0)) // UNIT + 2
-    sums = buffers.array('sums', 6 * units, np.float64)[:6 * units].reshape(units, 6)
+    moments = buffers.array('moments', MOMENTS * most, np.float64)[:MOMENTS * most].reshape(most, MOMENTS)
+    units = size // UNIT + 2
+    sums = buffers.array('sums', MOMENTS * units, np.float64)[:MOMENTS * units].reshape(units, MOMENTS)
     count = split(chains.offsets, chains.pixels, chains.codes, chains.bridged, 1 / variance, stride, margin, min_size,
-                  sums, attributes, members, offsets)
-    return Blobs(attributes[:count], members[:offsets[count]], offsets[:count + 1])
+                  sums, attributes, members, offsets, moments)
+    return Blobs(attributes[:count], members[:offsets[count]], offsets[:count + 1], moments[:count])
 
 
 @kernel
 def split(
     chain_offsets: Any, pixels: Any, codes: Any, bridged: Any, weight: float, stride: int, margin: int, min_size: int,
-    sums: Any, blobs: Any, members: Any, offsets: Any,
+    sums: Any, blobs: Any, members: Any, offsets: Any, moments: Any,
 ) -> int:
     """Divide every chain, and write out its stretches; return their number."""
     count, total = 0, 0
@@ -75,7 +76,7 @@ def split(
         first, size = chain_offsets[chain], chain_offsets[chain + 1] - chain_offsets[chain]
         if size < max(min_size, UNIT * (FIRST - 1) + 1):
             continue
-        sum_up(pixels[first:first + size], bridged[first:first + size], stride, sums)
+        sum_up(first, size, pixels, bridged, stride, margin, sums)
         units = (size + UNIT - 1) // UNIT
         unit = 0
         while unit + FIRST <= units:
@@ -84,6 +85,8 @@ def split(
                 unit += 1
                 continue
             start, stop = first + unit * UNIT, first + min(end * UNIT, size)
+            for k in range(MOMENTS):
+                moments[count, k] = sums[end, k] - sums[unit, k]
             unit = end
             if stop - start < min_size:
                 continue
@@ -96,32 +99,19 @@ def split(
     return count
 
 
-@kernel
-def sum_up(pixels: Any, bridged: Any, stride: int, sums: Any) -> None:
-    """Sums of 1, x, y, x^2, x y and y^2, from the chain's first pixel, up to each unit; filled gaps don't count."""
-    inverse = 1 / stride
-    first_row, first_column = position(pixels[0], inverse, stride)
-    n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
-    for k in range(pixels.size):
-        if k % UNIT == 0:
-            keep(sums, k // UNIT, n, sx, sy, sxx, sxy, syy)
-        if not bridged[k]:
-            row, column = position(pixels[k], inverse, stride)
-            x, y = column - first_column, row - first_row
-            n += 1
-            sx += x
-            sy += y
-            sxx += x * x
-            sxy += x * y
-            syy += y * y
-    keep(sums, (pixels.size + UNIT - 1) // UNIT, n, sx, sy, sxx, sxy, syy)
-
-
 @inlined
-def keep(sums: Any, unit: int, n: int, sx: int, sy: int, sxx: int, sxy: int, syy: int) -> None:
-    """Put down the sums up to a unit."""
-    sums[unit, 0], sums[unit, 1], sums[unit, 2] = n, sx, sy
-    sums[unit, 3], sums[unit, 4], sums[unit, 5] = sxx, sxy, syy
+def sum_up(first: int, size: int, pixels: Any, bridged: Any, stride: int, margin: int, sums: Any) -> None:
+    """The moments of a chain up to each unit; filled gaps don't count."""
+    inverse = 1 / stride
+    n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
+    for k in range(size):
+        if k % UNIT == 0:
+            put_down(sums, k // UNIT, n, sx, sy, sxx, sxy, syy)
+        row, column = position(pixels[first + k], inverse, stride)
+        counts = 0 if bridged[first + k] else 1
+        x, y = counts * (column - margin), counts * (row - margin)
+        n, sx, sy, sxx, sxy, syy = n + counts, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
+    put_down(sums, (size + UNIT - 1) // UNIT, n, sx, sy, sxx, sxy, syy)
 
 
 @inlined
@@ -157,15 +147,18 @@ def end_of_stretch(sums: Any, unit: int, units: int, weight: float) -> int:
 def describe(pixels: Any, codes: Any, start: int, stop: int, stride: int, margin: int, blob: Any) -> None:
     """Fill in the attributes of a stretch; of codes that are equally frequent the lower one counts."""
     inverse = 1 / stride
-    clear(blob)
-    blob['select'] = True
+    top, left = position(pixels[start], inverse, stride)
+    bottom, right = top, left
     counts: Any = np.int64(0)
     for k in range(start, stop):
         row, column = position(pixels[k], inverse, stride)
-        include(blob, 0, row - margin, column - margin)
+        top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
         counts += 1 << 15 * (np.int64(codes[k]) - 1)
     most: Any = -1
     for code in range(1, 5):
         if counts >> 15 * (code - 1) & 0x7FFF > most:
             most = counts >> 15 * (code - 1) & 0x7FFF
             blob['dir'] = code
+    blob['select'], blob['size'] = True, stop - start
+    blob['min_row'], blob['max_row'] = top - margin, bottom - margin
+    blob['min_col'], blob['max_col'] = left - margin, right - margin
