@@ -141,8 +141,8 @@ def kept_of(
     """gx and gy as later steps see them, with the pixel of padding that they may look at."""
     extract_edges(np.ascontiguousarray(image), Parameters.profile('paper', **parameters, refine=True), buffers)
     around = slice(PAD - 1, PAD + image.shape[0] + 1), slice(PAD - 1, PAD + image.shape[1] + 1)
-    values, quantum = kept_gradient(buffers)
-    gx, gy = np.moveaxis(values[around] * np.float32(quantum), 2, 0)
+    values, unit = kept_gradient(buffers)
+    gx, gy = np.moveaxis(values[around] * np.float32(unit), 2, 0)
     return gx, gy
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from line_feature_node.core.blobs import BLOB_DTYPE, Blobs
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.features import SEGMENT_DTYPE, compute_lines, segments_of
+from line_feature_node.core.features import LINE_DTYPE, SEGMENT_DTYPE, compute_lines, segments_of
 from line_feature_node.core.parameters import Parameters
 
 Pixel = tuple[int, int]
@@ -311,6 +311,15 @@ def test_nearly_vertical(height: int, leaning: int) -> None:
 @pytest.mark.parametrize(('size', 'min_size', 'count'), [(5, 5, 1), (4, 5, 0), (2, 2, 1), (1, 2, 0), (30, 31, 0)])
 def test_min_size(size: int, min_size: int, count: int) -> None:
     assert segments([line((1, 0), repeat=size - 1)], min_size=min_size).size == count
+
+
+def test_a_line_just_short_of_vertical_is_told_one_way_round() -> None:
+    """To the digits of theta it is vertical: its ends, rho and theta are those of a line that goes down."""
+    lines = np.zeros(1, LINE_DTYPE)
+    lines[0] = 2, *[0] * 10, 5, 10, 1e-9, -1, 5, 20, 5, 0
+    found = segments_of(lines, np.ones(1, np.bool_))[0]
+    assert ends(found) == [5, 0, 5, 20]
+    assert (found['theta'], found['rho'], found['length']) == (np.float32(math.pi / 2), -5, 20)
 
 
 def test_labels_not_in_use_give_nothing() -> None:

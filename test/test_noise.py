@@ -11,7 +11,6 @@ from line_feature_node.core import LineFeatureExtractor, Parameters
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.edges import PAD, extract_edges, kept_gradient
 from line_feature_node.core.noise import (
-    CLUTTERED,
     ROUNDING,
     STEP,
     STRONG_SHARE,
@@ -49,8 +48,8 @@ def kept(image: Image, parameters: Parameters) -> tuple[Image, Image]:
     buffers = Buffers()
     extract_edges(np.ascontiguousarray(image), parameters, buffers)
     inside = slice(PAD, PAD + image.shape[0]), slice(PAD, PAD + image.shape[1])
-    values, quantum = kept_gradient(buffers)
-    gx, gy = np.moveaxis(values[inside] * quantum, 2, 0)
+    values, unit = kept_gradient(buffers)
+    gx, gy = np.moveaxis(values[inside] * unit, 2, 0)
     return gx, gy
 
 
@@ -167,12 +166,17 @@ def test_noise_and_few_edges_are_no_clutter(sigma: float) -> None:
 
 
 def test_clutter_raises_the_thresholds() -> None:
-    """Unless T1 does not depend on the picture at all."""
+    """By the factor that is asked for, whatever they depend on besides."""
     quality = Quality(1.0, 7.0, 3.5)
     found = adapted(Parameters(), quality)
     raised = found.T1, found.T2
     assert raised == pytest.approx((7, 3.5), abs=STEP)
-    assert adapted(Parameters(noise_T1=0.0, noise_T2=0.0), quality).T1 == Parameters().T1
+    found = adapted(Parameters(noise_T1=0.0, noise_T2=0.0), quality)
+    assert raised == (found.T1, found.T2)
+    found = adapted(Parameters(clutter=1.5), quality)
+    assert (found.T1, found.T2) == (6, 3)
+    found = adapted(Parameters(clutter=1.0, noise_T1=0.0, noise_T2=0.0), quality)
+    assert (found.T1, found.T2) == (Parameters().T1, Parameters().T2)
     assert adapted(Parameters.paper(), quality) == Parameters.paper()
     found = adapted(Parameters(), Quality(1.0, 20.0, 20.0))
     assert found.T2 < found.T1
@@ -291,7 +295,7 @@ def test_masked_pixels_do_not_tell_what_the_noise_is(share: float) -> None:
 def test_clutter_raises_the_thresholds_by_so_much_at_most() -> None:
     """A fence fills the picture with edges that are all as strong."""
     found = adapted(Parameters(T1=5.0, T2=3.0), Quality(1.0, 100.0, 90.0))
-    assert (found.T1, found.T2) == (CLUTTERED * 5, CLUTTERED * 3)
+    assert (found.T1, found.T2) == (10, 6)
 
 
 @pytest.mark.parametrize('width', [4, 8, 16])

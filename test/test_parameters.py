@@ -516,7 +516,8 @@ def test_paper_does_not_depend_on_noise() -> None:
 
 
 @pytest.mark.parametrize(('given', 'expected'), [
-    ({'alpha': math.nan}, True), ({'noise_T1': 0.1}, True), ({'noise_T2': 0.1}, True), ({'alpha': 2.0}, False),
+    ({'alpha': math.nan}, True), ({'noise_T1': 0.1}, True), ({'noise_T2': 0.1}, True), ({'clutter': 1.1}, True),
+    ({'alpha': 2.0}, False),
     ({'refine': True, 'grouping': 'straightness'}, False)], ids=str)
 def test_adaptive_is_what_depends_on_the_noise(given: dict[str, Any], expected: bool) -> None:
     assert Parameters.profile('paper', **given).adaptive is expected

@@ -841,6 +841,7 @@ def test_any_image_and_parameters(image: Image, parameters: Parameters) -> None:
 
 beyond_the_paper = st.fixed_dictionaries({}, optional={
     'alpha': st.just(math.nan), 'noise_T1': st.floats(0, 100), 'noise_T2': st.floats(0, 100),
+    'clutter': st.floats(1, 100),
     'grouping': st.sampled_from(['codes', 'straightness']), 'refine': st.booleans(), 'min_snr': st.floats(0, 100),
     'false_alarms': st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), 'operator': st.just('sobel'),
     'thinning': st.sampled_from(['morphological', 'none']), 'min_chain': st.integers(1, 12),

@@ -29,7 +29,7 @@ class Buffers:
     def image(self, name: str, height: int, width: int, dtype: DTypeLike) -> NDArray[Any]:
         """A two-dimensional array of exactly that size, zero when it is new."""
         array = self._arrays.get(name)
-        if array is None or array.shape != (height, width):
+        if array is None or array.shape != (height, width) or array.dtype != dtype:
             array = self._arrays[name] = np.zeros((height, width), dtype)
         return array
 

@@ -40,9 +40,9 @@ NO_MARK, CODE_1, CODE_2, CODE_3, CODE_4, STRONG_MARK = (np.uint8(mark) for mark 
 SECTION = np.float32(math.tan(math.pi / 8))
 #: White, where parameters do not say it, by the kind and the bytes of pixels.
 WHITE = {('u', 1): 255.0, ('u', 2): 65535.0, ('f', 4): 255.0}
-#: The largest number that the gradient is kept as, and the steepest gradient that is told from others: 32 times what
-#: black and white make it in the nominal range.
-LARGEST, STEEPEST = 32767, 8192.0
+#: The largest number that the gradient of 8-bit images is kept as: that of black and white side by side, at most. The
+#: unit of others is about the same.
+LARGEST, UNIT = 32767, 1 / 128
 #: Added to every pixel: the recursion would fade into denormal numbers, which are slow, beside a black area.
 PEDESTAL = 1.0
 
@@ -67,7 +67,9 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     lines, columns = -(-height // LANES) * LANES, -(-(width + 2 * PAD) // TILE) * TILE
     plane = buffers.image('plane', lines + 2 * PAD, columns, np.float32)
     rows = buffers.image('rows', 15, columns, np.float32)
-    kept = buffers.image('gradient', lines + 2 * PAD if parameters.refine else 0, 2 * columns, np.int16)
+    whole = image.dtype == np.uint8
+    kept = buffers.image('gradient', lines + 2 * PAD if parameters.refine else 0, 2 * columns,
+                         np.int16 if whole else np.float32)
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     # An image of another width may have had the same padded one, and pixels where the padding is now.
     marks[:, MARGIN + width:] = 0
@@ -86,35 +88,30 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
         inside = slice(height + 2 * PAD), slice(width + 2 * PAD)
         cv2.GaussianBlur(plane[inside], (0, 0), parameters.sigma, dst=smoothed[inside], borderType=cv2.BORDER_REPLICATE)
         plane = smoothed
-    quantum = buffers.array('quantum', 1, np.float64)
-    quantum[0] = _quantum(image, scale) if parameters.refine else 1.0
+    unit = buffers.array('unit', 1, np.float64)
+    unit[0] = abs(scale) * 255 / LARGEST if whole else UNIT
     sweep(height, width, recursive, q, side, centre, parameters.T1, parameters.T2,
-          parameters.thinning == 'suppression', plane, rows, 1 / quantum[0], kept, marks)
+          parameters.thinning == 'suppression', plane, rows, 1 / unit[0], whole, kept, marks)
     return marks
 
 
 class Gradient(NamedTuple):
-    """The gradient of an image, in whole multiples of a quantum: half the memory of floats, and as much of the cache.
+    """The gradient of an image.
 
     Attributes:
-        values: Components along x and y, H×W×2 int16, padded by PAD.
-        quantum: What they are multiples of, in grey levels a pixel.
+        values: Components along x and y, H×W×2, padded by PAD: int16 of 8-bit images, of which no gradient is too
+            steep for that, as that takes half of the memory, and of the cache; float32 of others.
+        unit: What they are multiples of, in grey levels a pixel.
     """
 
-    values: NDArray[np.int16]
-    quantum: float
+    values: NDArray[Any]
+    unit: float
 
 
 def kept_gradient(buffers: Buffers) -> Gradient:
     """The gradient of the last image, where lines are refined."""
     values = buffers.last('gradient')
-    return Gradient(values.reshape(values.shape[0], -1, 2), float(buffers.last('quantum')[0]))
-
-
-def _quantum(image: NDArray[Any], scale: float) -> float:
-    """What the gradient is kept in multiples of: the finest that has room for the grey levels of the image."""
-    low, high = (0.0, 255.0) if image.dtype == np.uint8 else cv2.minMaxLoc(image)[:2]
-    return min(max(abs(scale) * (high - low), 1.0), STEEPEST) / LARGEST
+    return Gradient(values.reshape(values.shape[0], -1, 2), float(buffers.last('unit')[0]))
 
 
 def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float, float]:
@@ -292,7 +289,7 @@ def start_upwards(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
 @kernel
 def sweep(
     height: int, width: int, recursive: bool, q: float, side: float, centre: float, T1: float, T2: float, thin: bool,
-    plane: Any, rows: Any, per_quantum: float, kept: Any, marks: Any,
+    plane: Any, rows: Any, per_unit: float, whole: bool, kept: Any, marks: Any,
 ) -> None:
     """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it.
 
@@ -313,7 +310,7 @@ def sweep(
         combine_columns(smooth[below], smooth[above], smooth[middle], b, a, across, along)
         gradient(across, along, b, a, gx[above], gy[above], norm[above])
         if kept.size > 0:
-            keep(gx[above], gy[above], np.float32(per_quantum), kept[row + 1])
+            keep(gx[above], gy[above], np.float32(per_unit), whole, kept[row + 1])
         if row < height:
             suppress(norm[above], norm[middle], norm[below], gx[middle], gy[middle], np.float32(T1), np.float32(T2),
                      thin, marks[row + MARGIN, MARGIN:MARGIN + width])
@@ -339,12 +336,12 @@ def gradient(across: Any, along: Any, side: Any, centre: Any, gx: Any, gy: Any, 
 
 
 @inlined
-def keep(gx: Any, gy: Any, per_quantum: Any, kept: Any) -> None:
-    """Put down a row of the gradient in whole numbers, both components of a pixel beside each other."""
-    most = np.float32(LARGEST)
+def keep(gx: Any, gy: Any, per_unit: Any, whole: bool, kept: Any) -> None:
+    """Put down a row of the gradient, in whole numbers if asked for, both components of a pixel beside each other."""
     for i in range(gx.size):
-        kept[2 * i] = np.int16(np.rint(min(max(gx[i] * per_quantum, -most), most)))
-        kept[2 * i + 1] = np.int16(np.rint(min(max(gy[i] * per_quantum, -most), most)))
+        x, y = gx[i] * per_unit, gy[i] * per_unit
+        kept[2 * i] = np.rint(x) if whole else x
+        kept[2 * i + 1] = np.rint(y) if whole else y
 
 
 @inlined

@@ -188,6 +188,12 @@ def segments_of(lines: NDArray[np.void], alive: NDArray[np.bool_]) -> NDArray[np
     return segments
 
 
+@inlined
+def points_up(cos: float, sin: float) -> bool:
+    """Whether a direction is that of -pi/2, to the digits that theta has: the other way round it is in the range."""
+    return bool(sin < 0 and np.float32(np.arctan2(sin, cos)) <= -np.float32(np.pi / 2))
+
+
 @kernel
 def write_segments(lines: Any, alive: Any, segments: Any) -> None:
     """Fill in the records that users get."""
@@ -197,14 +203,14 @@ def write_segments(lines: Any, alive: Any, segments: Any) -> None:
             continue
         line = lines[k]
         segment = segments[count]
-        segment['x'], segment['y'], segment['z'] = line['x'], line['y'], 0
-        segment['x1'], segment['y1'] = line['x1'], line['y1']
-        segment['x2'], segment['y2'] = line['x2'], line['y2']
-        segment['length'] = np.hypot(line['x2'] - line['x1'], line['y2'] - line['y1'])
         cos, sin = line['cos'], line['sin']
-        theta = np.float32(np.arctan2(sin, cos))
-        # A line just short of vertical may round to -pi/2, which is not in the range.
-        segment['theta'] = theta if theta > -np.float32(np.pi / 2) else np.float32(np.pi / 2)
+        x1, y1, x2, y2 = line['x1'], line['y1'], line['x2'], line['y2']
+        if points_up(cos, sin):
+            cos, sin, x1, y1, x2, y2 = -cos, -sin, x2, y2, x1, y1
+        segment['x'], segment['y'], segment['z'] = line['x'], line['y'], 0
+        segment['x1'], segment['y1'], segment['x2'], segment['y2'] = x1, y1, x2, y2
+        segment['length'] = np.hypot(x2 - x1, y2 - y1)
+        segment['theta'] = np.arctan2(sin, cos)
         segment['intercept'] = line['y'] - sin / cos * line['x'] if cos >= VERTICAL else np.nan
         segment['rho'] = line['y'] * cos - line['x'] * sin
         segment['code'] = line['code']

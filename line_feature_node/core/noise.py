@@ -28,8 +28,6 @@ SOBEL_NOISE = math.sqrt(12) / 8
 #: Shares of the pixels that may exceed T1 and T2: where most of a picture is texture, what is weaker than half of it
 #: is no line that could be told from chance, and would cost the most time.
 STRONG_SHARE, WEAK_SHARE = 0.4, 0.5
-#: That raises the thresholds by this factor at most: a fence or a blind may fill a picture with strong edges.
-CLUTTERED = 2.0
 #: Rounding to whole grey levels is noise of this standard deviation, even where the picture has no other.
 ROUNDING = math.sqrt(1 / 12)
 #: Knots of alpha over the noise: little smoothing of a clean picture, as much as helps in a noisy one.
@@ -150,7 +148,7 @@ def adapted(parameters: Parameters, quality: Quality) -> Parameters:
     """The parameters with alpha, T1 and T2 as the image demands them.
 
     An alpha that is unset is chosen from the noise; T1 and T2 are raised to noise_T1 and noise_T2 times the noise of
-    the gradient and, where noise_T1 is not 0, to what a share of the pixels exceeds, CLUTTERED times as much at most.
+    the gradient, and to what a share of the pixels exceeds, `clutter` times as much at most.
     """
     return _adapted(parameters, *(round(value / STEP) * STEP for value in quality))
 
@@ -161,9 +159,8 @@ def _adapted(parameters: Parameters, noise: float, strong: float, weak: float) -
     alpha = float(np.interp(noise, ALPHA_NOISE, ALPHA)) if math.isnan(p.alpha) else p.alpha
     chosen = dataclasses.replace(p, alpha=alpha)
     of_gradient = noise * gradient_noise(chosen)
-    most = CLUTTERED if p.noise_T1 > 0 else 1.0
-    T1 = min(max(p.T1, p.noise_T1 * of_gradient, min(strong, most * p.T1)), p.specs()['T1'].high)
-    T2 = min(max(p.T2, p.noise_T2 * of_gradient, min(weak, most * p.T2)), LARGEST_SHARE * T1)
+    T1 = min(max(p.T1, p.noise_T1 * of_gradient, min(strong, p.clutter * p.T1)), p.specs()['T1'].high)
+    T2 = min(max(p.T2, p.noise_T2 * of_gradient, min(weak, p.clutter * p.T2)), LARGEST_SHARE * T1)
     return dataclasses.replace(chosen, T1=T1, T2=T2)
 
 

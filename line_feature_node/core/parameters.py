@@ -137,6 +137,9 @@ class Parameters(ParameterSet):
         low=0.0, high=100.0)
     noise_T2: float = parameter(
         2.0, "T2 is raised to so many standard deviations of the gradient's noise.", low=0.0, high=100.0)
+    clutter: float = parameter(
+        2.0, 'Where texture fills half of a picture, T1 and T2 are raised to what that has, by this factor at most; 1 '
+        'turns it off.', low=1.0, high=100.0)
     intensity_min: float = parameter(
         math.nan, 'Pixel value that counts as grey level 0; unset: 0.', low=-1e9, high=1e9, unset=True)
     intensity_max: float = parameter(
@@ -202,7 +205,7 @@ class Parameters(ParameterSet):
     @property
     def adaptive(self) -> bool:
         """Whether alpha or the thresholds depend on the noise."""
-        return math.isnan(self.alpha) or self.noise_T1 > 0 or self.noise_T2 > 0
+        return math.isnan(self.alpha) or self.noise_T1 > 0 or self.noise_T2 > 0 or self.clutter > 1
 
     @classmethod
     def paper(cls) -> 'Parameters':

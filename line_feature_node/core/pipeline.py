@@ -264,11 +264,11 @@ def _ridges(
 ) -> Ridges:
     """The gradient that edge extraction left, nothing where the mask is, with what is known of its noise."""
     height, width = shape
-    gradient, quantum = kept_gradient(buffers)
+    gradient, unit = kept_gradient(buffers)
     if keep is not None:
         gradient[PAD:PAD + height, PAD:PAD + width][keep == 0] = 0
-    return Ridges(gradient, PAD, height, width, noise * gradient_noise(parameters) / quantum,
-                  step_response(parameters) / quantum, correlation_length(parameters))
+    return Ridges(gradient, PAD, height, width, noise * gradient_noise(parameters) / unit,
+                  step_response(parameters) / unit, correlation_length(parameters))
 
 
 def working_picture(

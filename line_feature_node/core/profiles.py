@@ -31,6 +31,7 @@ PROFILES = {
         'T2': (3.0, 'An edge is followed down to a step of 13 grey levels.'),
         'noise_T1': (0.0, 'The thresholds are the same for all pictures.'),
         'noise_T2': (0.0, 'The lower threshold does not depend on the noise either.'),
+        'clutter': (1.0, 'Nor does either on texture.'),
         'grouping': ('codes', 'Line-blobs are connected pixels of one code.'),
         'refine': (False, 'Lines are fitted to their blobs, and linked.'),
     }),

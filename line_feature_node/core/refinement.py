@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
-from line_feature_node.core.features import SEGMENT_DTYPE, VERTICAL
+from line_feature_node.core.features import SEGMENT_DTYPE, VERTICAL, points_up
 from line_feature_node.core.parameters import Parameters
 
 #: A line while it grows.
@@ -101,7 +101,7 @@ class Ridges(NamedTuple):
     """What refinement reads, besides the lines.
 
     Attributes:
-        gradient: H×W×2 int16, padded: its components along x and y, in whole numbers of some unit.
+        gradient: H×W×2, padded: its components along x and y, in some unit.
         pad: Its padding on each side.
         height, width: Of the picture.
         noise: Standard deviation of the noise of a component, in that unit.
@@ -109,7 +109,7 @@ class Ridges(NamedTuple):
         correlation: Pixels along an edge whose noise counts as one.
     """
 
-    gradient: NDArray[np.int16]
+    gradient: NDArray[Any]
     pad: int
     height: int
     width: int
@@ -235,7 +235,7 @@ def align(
 
     Args:
         line: It is changed, and receives its mean response.
-        gradient: Its components, flat, in whole numbers.
+        gradient: Its components, flat.
         in_p, in_q: Index of the components along p and q at the first pixel of the picture.
         step_p, step_q: What a step along p and q adds to an index.
         size_p, size_q: Pixels of the picture along p and q.
@@ -658,21 +658,20 @@ def write(
         slope, first, last = line['slope'], line['first'], line['last']
         scale = 1 / math.sqrt(1 + slope * slope)
         q1, q2 = slope * first + line['intercept'], slope * last + line['intercept']
-        turned = line['steep'] and slope < 0
         if line['steep']:
             x1, y1, x2, y2 = q1, first, q2, last
             cos, sin = slope * scale, scale
         else:
             x1, y1, x2, y2 = first, q1, last, q2
             cos, sin = scale, slope * scale
+        turned = cos < 0 and not points_up(-cos, -sin)
         if turned:
             x1, y1, x2, y2, cos, sin = x2, y2, x1, y1, -cos, -sin
         x, y = 0.5 * (x1 + x2), 0.5 * (y1 + y2)
         segment['x'], segment['y'], segment['z'] = x, y, 0
         segment['x1'], segment['y1'], segment['x2'], segment['y2'] = x1, y1, x2, y2
         segment['length'] = length_of(line)
-        theta = np.float32(math.atan2(sin, cos))
-        segment['theta'] = theta if theta > -np.float32(np.pi / 2) else np.float32(np.pi / 2)
+        segment['theta'] = math.atan2(sin, cos)
         segment['intercept'] = y - sin / cos * x if cos >= VERTICAL else np.nan
         segment['rho'] = y * cos - x * sin
         # The code of the gradient's direction: its sections are centred on multiples of 45 degrees.
