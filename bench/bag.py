@@ -5,9 +5,9 @@
 Every case has a short recording and one ten times as long, of the same frames in turn: mcap without compression, as
 `ros2 bag record` writes it. All contestants take turns in each round, and medians count. The rate of a run is that of
 the frames by which the long recording is longer, so without the start of the processes, which is given apart. Bare is
-one thread of this process with the frames in memory: the extraction, and before it the decoding of the message. The
-share is what a run with one worker does of that; a run's writer is a process of its own. CPU is what a run takes of
-the processors, for each frame, over what bare takes: unlike rates it hardly depends on what else the machine does.
+one thread of this process with the frames in memory: the extraction, and before it the decoding of the message. It is
+timed before and after each run. The share is what a run does of that; its writer is a process of its own. CPU is what
+a run takes of the processors, for each frame, over what bare takes.
 Memory is the sum over all processes of a run, sampled.
 """
 
@@ -168,26 +168,32 @@ def resident(pid: int) -> int:
 
 
 def one_round(case: Case, folder: Path, made: list[bytes], extractor: LineFeatureExtractor) -> dict[str, Any]:
-    """All contestants in turn."""
+    """All contestants in turn; what a machine does changes from minute to minute, so each run has bare ones around."""
     short, long = folder / f'{case.name}-short', folder / f'{case.name}-long'
-    result: dict[str, Any] = {**bare(case, made, extractor), 'reading': timed(lambda: reading(long))}
+    result: dict[str, Any] = {'reading': timed(lambda: reading(long))}
+    alone = [bare(case, made, extractor)]
     for everything in (False, True):
         for workers in dict.fromkeys((1, len(os.sched_getaffinity(0)))):
             some, all_ = (run(path, workers, everything=everything) for path in (short, long))
-            result[f'{"everything" if everything else "segments"}, {workers}'] = {
-                **{f'{key}, short': value for key, value in some.items()},
-                **{f'{key}, long': value for key, value in all_.items()}}
+            alone.append(bare(case, made, extractor))
+            around = [one['decoding and extraction'] for one in alone[-2:]]
+            name = f'{"everything" if everything else "segments"}, {workers}'
+            result[name] = with_rates(case, some, all_, {key: statistics.mean(one[key] for one in around)
+                                                         for key in ('clock', 'cpu')})
+    for name in alone[0]:
+        result[name] = {key: statistics.median(one[name][key] for one in alone) for key in alone[0][name]}
     return result
 
 
-def with_rates(case: Case, row: dict[str, float]) -> dict[str, float]:
-    """What follows from the times of a run: seconds for each further frame, and those that are there without any."""
-    if 'clock, long' not in row:
-        return row
+def with_rates(
+    case: Case, some: dict[str, float], all_: dict[str, float], alone: dict[str, float],
+) -> dict[str, float]:
+    """Of a run over a short and a long recording: seconds for each further frame, those before any, and shares."""
     more = case.frames * (LONG - 1)
-    slopes = {key: (row[f'{key}, long'] - row[f'{key}, short']) / more for key in ('clock', 'cpu')}
-    return {**row, **slopes, 'start': row['clock, short'] - case.frames * slopes['clock'],
-            'whole': row['clock, long'] / (case.frames * LONG)}
+    clock, cpu = ((all_[key] - some[key]) / more for key in ('clock', 'cpu'))
+    return {'clock': clock, 'cpu': cpu, 'share': alone['clock'] / clock, 'times': cpu / alone['cpu'],
+            'start': some['clock'] - case.frames * clock, 'whole': all_['clock'] / (case.frames * LONG),
+            'memory, short': some['memory'], 'memory, long': all_['memory']}
 
 
 def medians(rounds: list[dict[str, Any]]) -> dict[str, Any]:
@@ -197,15 +203,18 @@ def medians(rounds: list[dict[str, Any]]) -> dict[str, Any]:
 
 def show(case: Case, found: dict[str, Any]) -> None:
     """A table of one case."""
-    alone = found['decoding and extraction']
     print(f'\n{case.name}, {case.frames} and {case.frames * LONG} frames')
     print(f'{"":26}{"frames/s":>10}{"share":>8}{"CPU":>8}{"start, s":>10}{"whole run":>11}{"MB, short":>11}{"long":>7}')
     for name, row in found.items():
-        line = f'{name:26}{1 / row["clock"]:10.0f}{alone["clock"] / row["clock"]:8.2f}{row["cpu"] / alone["cpu"]:8.2f}'
+        line = f'{name:26}{1 / row["clock"]:10.0f}'
         if 'start' in row:
-            line += f'{row["start"]:10.2f}{1 / row["whole"]:11.0f}'
+            line += f'{row["share"]:8.2f}{row["times"]:8.2f}{row["start"]:10.2f}{1 / row["whole"]:11.0f}'
             line += f'{row["memory, short"]:11.0f}{row["memory, long"]:7.0f}'
-        print(line)
+        print(line, flush=True)
+    workers = len(os.sched_getaffinity(0))
+    for name in ('segments', 'everything') if workers > 1 else ():
+        gain = found[f'{name}, 1']['clock'] / found[f'{name}, {workers}']['clock']
+        print(f'{name}: {gain:.2f} times as many frames/s with {workers} workers as with one', flush=True)
 
 
 def main() -> None:
@@ -228,7 +237,7 @@ def main() -> None:
                 record(folder / f'{case.name}-{ending}', case, made, frames)
             bare(case, made, extractor)  # memory and kernels are there from now on
             rounds = [one_round(case, folder, made, extractor) for _ in range(options.rounds)]
-            results[case.name] = {name: with_rates(case, row) for name, row in medians(rounds).items()}
+            results[case.name] = medians(rounds)
             show(case, results[case.name])
     if options.results:
         options.results.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -39,12 +39,17 @@ class Messages:
             segments: SEGMENT_DTYPE.
             header: std_msgs/Header of the image they were found in.
         """
-        field = self.types('sensor_msgs/msg/PointField')
         return self.types('sensor_msgs/msg/PointCloud2')(
             header=header, height=1, width=len(segments),
-            fields=[field(name=name, offset=offset, datatype=kind, count=1) for name, offset, kind in point_fields()],
+            fields=self._fields,
             is_bigendian=False, point_step=SEGMENT_DTYPE.itemsize, row_step=SEGMENT_DTYPE.itemsize * len(segments),
             data=self.octets(little_endian(segments)), is_dense=True)
+
+    @cached_property
+    def _fields(self) -> list[Any]:
+        """The fields of a segment; all messages share them, as they take longer to make than the rest of a message."""
+        field = self.types('sensor_msgs/msg/PointField')
+        return [field(name=name, offset=offset, datatype=kind, count=1) for name, offset, kind in point_fields()]
 
     def markers(self, segments: NDArray[np.void], header: Any) -> Any:
         """A visualization_msgs/ImageMarker with a line for each segment, in the colour of its direction code.

@@ -252,7 +252,7 @@ def _header(header: Any) -> Any:
 
 
 def _orientations(segments: NDArray[np.void]) -> list[float]:
-    bands = np.floor((segments['theta'] / np.pi + 0.5) * BANDS).clip(0, BANDS - 1).astype(int)
+    bands = np.minimum((segments['theta'] * (BANDS / np.pi) + BANDS / 2).astype(np.intp), BANDS - 1)
     lengths: list[float] = np.bincount(bands, segments['length'], BANDS).round(1).tolist()
     return lengths
 
