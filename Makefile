@@ -5,6 +5,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Photographs to measure speed on, separated by spaces; without, the rendered corridor is used.
 PHOTOS ?=
+# Other scenes to measure accuracy on, and the folder of York Urban (images/*.jpg, gt_csv/*.csv), if it is there.
+SEED ?= 0
+YORK ?=
 # The ROS 2 packages of PyPI are for these machines only; others have ROS 2 from their distribution.
 EXTRA := $(if $(filter x86_64,$(shell uname -m)),ros)
 # opencv-contrib, which has EdgeDrawing, cannot be where OpenCV is.
@@ -42,8 +45,9 @@ lint: $(VENV)/.lint
 colcon: $(VENV)/.colcon
 	.ci/colcon $(BIN)
 
-# Speed beside OpenCV's detectors, as a table, and two curves in bench/results.
+# Accuracy and speed beside OpenCV's detectors, as tables, and curves in bench/results.
 bench: $(PEERS)/.installed
+	$(PEERS)/bin/python bench/accuracy.py --seed $(SEED) $(if $(YORK),--york "$(YORK)") --results bench/results
 	$(PEERS)/bin/python bench/speed.py $(PHOTOS) --results bench/results
 	$(PEERS)/bin/python bench/cold_start.py
 

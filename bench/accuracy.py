@@ -7,7 +7,8 @@ smaller and blurred, with Gaussian noise of each sigma; another seed gives other
 and gt_csv/*.csv: x1,y1,x2,y2 a line, 0.7 pixels more than pixel centres are. Precision is the share of the length of
 segments that lies on true ones, recall the share of the true length that is covered, F their harmonic mean; angle and
 offset are medians over the segments that match (line_feature_node/truth.py has the tolerances). Each scene counts the
-same. With a folder for results the table goes there as JSON, with a plot of F by noise.
+same. With a folder for results the table goes there as JSON, with plots of F by noise and of precision against recall:
+of each detector the segments are kept from one length on after the other, as any of them could be asked to.
 """
 
 import argparse
@@ -31,6 +32,8 @@ Scene = tuple[NDArray[np.float32], Lines, Lines]
 
 WIDTH, HEIGHT = 640, 480
 SIGMAS = (0, 5, 10, 20, 30)
+#: Precision is drawn against recall for this noise, and for segments from these lengths on, in pixels.
+CURVE_SIGMA, LENGTHS = 20, (0, 10, 15, 20, 30, 40, 60, 80, 120)
 #: Edges are drawn so many times as large.
 SUPERSAMPLING = 8
 #: Steps of fewer grey levels are too weak to be asked for.
@@ -144,14 +147,34 @@ def false_segments(detect: Detector, count: int) -> float:
     return float(np.mean(found))
 
 
-def draw(table: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
-    """F by noise."""
-    figure = Figure((6.5, 4.2), layout='constrained')
-    axes = figure.subplots()
+def curve(detect: Detector, scenes: list[Scene], sigma: float) -> list[tuple[float, float]]:
+    """Recall and precision of the segments from each of LENGTHS on, means over the scenes; none where none has any."""
+    pairs: list[list[tuple[float, float]]] = [[] for _ in LENGTHS]
+    for number, (image, true, weak) in enumerate(scenes):
+        found = detect(with_noise(image, sigma, number))
+        length = np.hypot(found[:, 2] - found[:, 0], found[:, 3] - found[:, 1])
+        for least, some in zip(LENGTHS, pairs, strict=True):
+            agreement = compare(found[length >= least], true, weak)
+            some.append((agreement.recall, agreement.precision))
+    points = []
+    for recalls, precisions in (np.transpose(some) for some in pairs):
+        if not np.isnan(precisions).all():  # where nothing is found, nothing of it is true or false
+            points.append((float(recalls.mean()), float(np.nanmean(precisions))))
+    return points
+
+
+def draw(table: dict[str, dict[str, dict[str, float]]], curves: dict[str, dict[str, Any]], path: Path) -> None:
+    """F by noise, and precision against recall for each set of scenes."""
+    figure = Figure((5.5 * (1 + len(curves)), 4.4), layout='constrained')
+    first, *others = np.ravel(figure.subplots(1, 1 + len(curves)))
     for name, row in table.items():
-        axes.plot(SIGMAS, [row[str(sigma)]['F'] for sigma in SIGMAS], 'o-', label=name)
-    axes.set(xlabel='sigma of the noise, grey levels', ylabel='F', ylim=(0, 1), title='drawn scenes of 640×480')
-    axes.legend()
+        first.plot(SIGMAS, [row[str(sigma)]['F'] for sigma in SIGMAS], 'o-', label=name)
+    first.set(xlabel='sigma of the noise, grey levels', ylabel='F', ylim=(0, 1), title='drawn scenes of 640×480')
+    first.legend()
+    for axes, (title, of_detectors) in zip(others, curves.items(), strict=True):
+        for name, points in of_detectors.items():
+            axes.plot(*np.transpose(points), 'o-', label=name)
+        axes.set(xlabel='recall', ylabel='precision', xlim=(0, 1), ylim=(0, 1), title=title)
     figure.savefig(path, dpi=110)
 
 
@@ -179,9 +202,13 @@ def main() -> None:
         print(f'| {name} | {" | ".join(cells)} | {false:.1f} |', flush=True)
         table[name] = {**row, 'noise': {'false': false}}
     if options.results:
+        sets = {f'drawn scenes, sigma {CURVE_SIGMA}, by least length': (drawn, CURVE_SIGMA),
+                **({'York Urban, by least length': (labelled, 0)} if labelled else {})}
+        curves = {title: {name: curve(detect, *scenes) for name, detect in detectors().items()}
+                  for title, scenes in sets.items()}
         options.results.mkdir(parents=True, exist_ok=True)
-        (options.results / 'accuracy.json').write_text(json.dumps(table, indent=1))
-        draw(table, options.results / 'accuracy.png')
+        (options.results / 'accuracy.json').write_text(json.dumps({'table': table, 'curves': curves}, indent=1))
+        draw(table, curves, options.results / 'accuracy.png')
 
 
 if __name__ == '__main__':
