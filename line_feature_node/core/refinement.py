@@ -72,8 +72,9 @@ TANGENT = 0.8
 TOLERANCE = 2.5
 #: Shorter lines are dropped, in pixels; while growing, in steps of p.
 SHORTEST, SHORTEST_GROWING = 9.0, 4.0
-#: A first guess grows when it has this part of what is asked of a line in the end.
-HOPE = 0.4
+#: A first guess grows when it has this part of what is asked of a line in the end, and what has grown is aligned to
+#: peaks when it has this.
+HOPE, GROWN = 0.45, 0.85
 #: Claims are kept in cells of so many pixels squared. A line claims those within this distance, in pixels; a line of
 #: which more than this part is claimed is dropped.
 CELL, CLAIM, CLAIMED = 2, 2.0, 0.6
@@ -483,7 +484,8 @@ def grow(
         in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], origin, stride, height, width)
         grow_line(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
         line['size'] = 0
-        if line['last'] - line['first'] >= SHORTEST_GROWING:
+        if line['last'] - line['first'] >= SHORTEST_GROWING and is_clear(line, counts, GROWN * least[0],
+                                                                         GROWN * least[1]):
             settle(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
         if line['size'] > 0 and claimed(line, claims, height, width) <= CLAIMED:
             line['alive'] = True
