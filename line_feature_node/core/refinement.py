@@ -67,7 +67,7 @@ MEMORY = 24
 #: The search for an end begins so many steps and half a window inside.
 INSIDE = 3
 #: A pixel supports the line where the gradient along it is at most this part of that across it, ...
-TANGENT = 0.8
+TANGENT = np.float32(0.8)
 #: ... and that across it does not grow beside it, both but for so many standard deviations of noise.
 TOLERANCE = 2.5
 #: Shorter lines are dropped, in pixels; while growing, in steps of p.
@@ -80,8 +80,9 @@ HOPE, GROWN = 0.45, 0.85
 CELL, CLAIM, CLAIMED = 2, 2.0, 0.6
 #: Between the centres of two pixels.
 HALF = 0.5
-#: Sums along a line begin with it: single precision is enough for them, and saves conversions.
-ZERO = np.float32(0)
+#: Single precision is enough for what is seen of the gradient, and for sums along a line; with double precision most of
+#: the time would go into conversions.
+ZERO, ONE = np.float32(0), np.float32(1)
 #: What lies beyond this is no place in a picture.
 FARTHEST = 1e12
 #: atan s = s (pi/4 + ARC (1 - s)), about, for s from 0 to 1 (Rajan and others, 2006).
@@ -144,7 +145,7 @@ def refine_lines(
     # The first bits of floats are in their order, and sorted faster, by counting.
     order = np.argsort(~(strengths.view(np.uint32) >> 16).astype(np.uint16), kind='stable')
     claims = buffers.array('claims', height * width, np.uint8)[:-(-height // CELL) * -(-width // CELL)]
-    values = buffers.array('responses', 2 * (height + width) + 4 * MEMORY, np.float64)
+    values = buffers.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
     counts = buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS]
     count_norms(gradient, pad, height, width, counts)
     tests = 2 * math.log10(height * width)
@@ -356,7 +357,7 @@ def support(
     """
     r = int(q)
     lower = np.float32(q - r)
-    upper = 1 - lower
+    upper = ONE - lower
     index_p, index_q = along_p + r * step_q, along_q + r * step_q
     p1, p2 = gradient[np.uint64(index_p)], gradient[np.uint64(index_p + step_q)]
     q1, q2 = gradient[np.uint64(index_q)], gradient[np.uint64(index_q + step_q)]
@@ -366,7 +367,7 @@ def support(
     behind = upper * second + lower * across(gradient, index_p + 2 * step_q, index_q + 2 * step_q, np_, nq)
     tangential = abs(nq * (upper * p1 + lower * p2) - np_ * (upper * q1 + lower * q2))
     supports = (tangential <= TANGENT * response + tolerance) & (max(before, behind) <= response + tolerance)
-    return response if supports else min(response, np.float32(0))
+    return response if supports else min(response, ZERO)
 
 
 @kernel
@@ -388,10 +389,10 @@ def extend(
     first, last = line['first'], line['last']
     if at_last:
         line['last'] = end_of(line, 1, last, first, half, gradient, in_p, in_q, step_p, step_q, size_p, size_q,
-                              TOLERANCE * noise, limit, values)
+                              np.float32(TOLERANCE * noise), limit, values)
     if at_first:
         line['first'] = -end_of(line, -1, -first, -last, half, gradient, in_p, in_q, step_p, step_q, size_p, size_q,
-                                TOLERANCE * noise, limit, values)
+                                np.float32(TOLERANCE * noise), limit, values)
 
 
 @kernel
@@ -414,7 +415,7 @@ def end_of(
     window, earlier, found = 0.0, 2 * END * before, float(place)
     step = base
     while True:
-        value = 0.0
+        value = ZERO
         if nearest <= step <= farthest:
             p = way * step
             value = support(slope * p + intercept, gradient, in_p + p * step_p, in_q + p * step_p, step_q, np_, nq,
