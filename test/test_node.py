@@ -28,7 +28,7 @@ from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import ImageMarker
 
 from line_feature_node import node as node_module
-from line_feature_node.core import STEPS, LineFeatureExtractor, Parameters
+from line_feature_node.core import STEPS, LineFeatureExtractor, Parameters, end_points
 from line_feature_node.images import compressed_image_of
 from line_feature_node.messages import segments_of
 from line_feature_node.node import OUTPUTS, ConfigurationError, LineFeatureNode, spin
@@ -399,8 +399,9 @@ def test_encodings_come_through_the_topic(bench, encoding):
     }.get(encoding, np.repeat(grey[..., None], 3, -1))
     found = segments_of(bench.result(camera, node, segments, image(pixels, encoding)))
     assert len(found) == len(expected(grey)) > 0
-    for name in ('x1', 'y1', 'x2', 'y2'):
-        np.testing.assert_allclose(found[name], expected(grey)[name], atol=1e-3)
+    # Which end of a vertical line comes first hangs on the last digit.
+    np.testing.assert_allclose(*(np.sort(end_points(segments)[:, [[0, 2], [1, 3]]], -1)
+                                 for segments in (found, expected(grey))), atol=1e-3)
 
 
 @pytest.mark.parametrize(('remapping', 'topic'), [
