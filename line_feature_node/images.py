@@ -1,6 +1,7 @@
 """Images of the outside world as arrays: messages, of topics and recordings alike, and compressed files."""
 
 import math
+import re
 import struct
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,10 @@ from line_feature_node.core import Parameters
 from line_feature_node.core.edges import intensity_map
 
 JPEG, JPEG_SCAN, JPEG_END = b'\xff\xd8\xff', 0xDA, b'\xff\xd9'
+#: As decoders find a marker: they skip what comes before it, and bytes of filling.
+JPEG_MARKER = re.compile(rb'\xff+([^\x00\xff])', re.DOTALL)
+#: Markers without a length: TEM, and RST0 to RST7.
+JPEG_BARE = {0x01, *range(0xD0, 0xD8)}
 PNG, PNG_END = b'\x89PNG', b'IEND\xaeB`\x82'
 #: Markers of a JPEG that announce its size: all of SOF0 to SOF15 but the tables DHT, JPG and DAC among them.
 JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -117,18 +122,21 @@ def _pixels_of(message: Any, encoding: Encoding) -> NDArray[Any]:
 def compressed_image_of(message: Any) -> NDArray[Any]:
     """The grey picture of a sensor_msgs/CompressedImage, whichever library made the message.
 
-    Drivers write many things into `format`, so the data tell whether it is JPEG, PNG or another picture; only
-    compressed depth images are known by their format.
+    Drivers write many things into `format`, so the data tell whether it is JPEG or PNG; only compressed depth images
+    are known by their format. Nothing else is decoded, as anybody may send it: how much memory a picture of another
+    kind needs is known only when it has it.
 
     Returns:
         H×W uint8, uint16 or float32.
 
     Raises:
-        ValueError: The data are no picture, or only a part of one.
+        ValueError: The data are no such picture, or only a part of one.
     """
     data = bytes(message.data)
     if 'compressedDepth' in message.format:
         return _depth_of(data, message.format)
+    if data and not data.startswith((JPEG, PNG)):
+        raise ValueError(f'not an image as JPEG or PNG: {len(data)} bytes that begin with {data[:4]!r}')
     return decode(data, grey=True)
 
 
@@ -163,6 +171,9 @@ def decode(data: bytes, *, grey: bool = False) -> NDArray[Any]:
     if not _is_whole(data):
         raise ValueError(f'a part of an image: {len(data)} bytes without the end of the picture')
     width, height = _announced_size(data)
+    if not width * height and data.startswith((JPEG, PNG)):
+        kind = 'PNG' if data.startswith(PNG) else 'JPEG'
+        raise ValueError(f'not an image: {len(data)} bytes of {kind} without a size')
     if width * height > MOST_PIXELS:
         raise ValueError(f'an image of {width}×{height} pixels: expected {MOST_PIXELS} at most')
     channels = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR
@@ -186,7 +197,7 @@ def _is_whole(data: bytes) -> bool:
 
 
 def _announced_size(data: bytes) -> tuple[int, int]:
-    """Width and height in the header of a JPEG or PNG; 0, 0 where there is none, as in other formats."""
+    """Width and height in the header of a JPEG or PNG; 0, 0 where they are not found, as in other formats."""
     if data.startswith(JPEG):
         return _jpeg_header(data)[1]
     if data.startswith(PNG) and len(data) >= 24:
@@ -198,11 +209,13 @@ def _announced_size(data: bytes) -> tuple[int, int]:
 def _jpeg_header(data: bytes) -> tuple[int, tuple[int, int]]:
     """Where the picture itself begins in a JPEG, behind its header, which may hold a thumbnail; and its size."""
     place, size = 2, (0, 0)
-    while place + 4 <= len(data) and data[place] == 0xFF and data[place + 1] != JPEG_SCAN:
-        if data[place + 1] in JPEG_SIZES and place + 9 <= len(data):
-            height, width = struct.unpack_from('>HH', data, place + 5)
+    while (marker := JPEG_MARKER.search(data, place)) and marker[1][0] != JPEG_SCAN:
+        place = marker.end()
+        if marker[1][0] in JPEG_SIZES and place + 7 <= len(data):
+            height, width = struct.unpack_from('>HH', data, place + 3)
             size = width, height
-        place += 2 + int.from_bytes(data[place + 2:place + 4], 'big')
+        if marker[1][0] not in JPEG_BARE:
+            place += int.from_bytes(data[place:place + 2], 'big')
     return place, size
 
 

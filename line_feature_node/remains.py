@@ -31,9 +31,9 @@ from mcap.records import Chunk, Schema
 
 #: What files begin with.
 ROS1, MCAP, SQLITE3, ZSTD = b'#ROSBAG V2.0\n', b'\x89MCAP0\r\n', b'SQLite format 3\0', b'\x28\xb5\x2f\xfd'
-#: No record is as large, so that a length that is damaged does not fill the memory.
+#: No record is as large, nor a chunk once decompressed, so that what is damaged or malicious does not fill the memory.
 LARGEST = 2**30
-#: Compressed bytes that are decompressed at a time.
+#: Bytes that are decompressed at a time.
 PIECE = 2**16
 #: Errors of writing a temporary file, not of reading.
 FULL = (errno.EDQUOT, errno.EFBIG, errno.ENOSPC)
@@ -71,7 +71,7 @@ class Message(NamedTuple):
 
 
 class _Decompressor(Protocol):
-    def decompress(self, data: bytes, /) -> bytes: ...
+    def decompress(self, data: bytes, max_length: int, /) -> bytes: ...
 
 
 def kind_of(path: Path) -> bytes:
@@ -216,19 +216,28 @@ def _of_chunk(
 
 
 def _decompressed(compression: str, data: bytes) -> bytes:
-    """What can be had of a chunk: all of it, or what precedes a cut or the damage."""
+    """What can be had of a chunk: all of it, or what precedes a cut or the damage, or is more than there can be."""
     if compression in ('', 'none'):
         return data
-    makers = {'bz2': bz2.BZ2Decompressor, 'lz4': lz4.frame.LZ4FrameDecompressor,
-              'zstd': zstandard.ZstdDecompressor().decompressobj}
-    if compression not in makers:
-        return b''
-    decompressor: _Decompressor = makers[compression]()
     found = io.BytesIO()
     with contextlib.suppress(EOFError, OSError, RuntimeError, ValueError, zstandard.ZstdError):
-        for place in range(0, len(data), PIECE):
-            found.write(decompressor.decompress(data[place:place + PIECE]))
+        for piece in _pieces(compression, data):
+            found.write(piece)
+            if found.tell() > LARGEST:  # a few bytes may stand for any number of them
+                break
     return found.getvalue()
+
+
+def _pieces(compression: str, data: bytes) -> Iterator[bytes]:
+    makers = {'bz2': bz2.BZ2Decompressor, 'lz4': lz4.frame.LZ4FrameDecompressor}
+    if compression == 'zstd':
+        reader = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data))
+        while piece := reader.read(PIECE):
+            yield piece
+    elif compression in makers:
+        decompressor: _Decompressor = makers[compression]()
+        for place in range(0, len(data), PIECE):
+            yield decompressor.decompress(data[place:place + PIECE], LARGEST)
 
 
 def _inflated(data: bytes) -> bytes:

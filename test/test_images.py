@@ -392,6 +392,40 @@ def test_picture_beyond_all_measure_is_not_even_decoded(form, monkeypatch):
         compressed_image_of(compressed(bytes(12) * ('Depth' in form) + data, form))
 
 
+def with_bytes_before_its_size(data, more):
+    place = data.index(b'\xff\xc0')
+    return compressed(data[:place] + more + data[place:], 'jpeg')
+
+
+@pytest.mark.parametrize('more', [b'\xff', b'\xff' * 7, b'\xff\x01', b'\xff\xd0\xff', b'\xff\0', b'\0', b'\0\xff\x01'])
+def test_the_size_of_a_jpeg_is_found_behind_all_that_decoders_pass_over(more, monkeypatch):
+    assert compressed_image_of(with_bytes_before_its_size(encoded('.jpg', GREY), more)).shape == GREY.shape
+    monkeypatch.setattr(cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
+    with pytest.raises(ValueError, match='an image of 60000×60000 pixels'):
+        compressed_image_of(with_bytes_before_its_size(huge('.jpg'), more))
+
+
+@pytest.mark.parametrize('form', ['jpeg', 'png'])
+def test_a_picture_whose_size_is_not_found_is_not_even_decoded(form, monkeypatch):
+    data = encoded('.jpg', GREY).replace(b'\xff\xc0', b'\xff\xfe')
+    if form == 'png':
+        data = encoded('.png', GREY)
+        data = data[:16] + bytes(4) + data[20:]
+    monkeypatch.setattr(cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
+    with pytest.raises(ValueError, match=f'not an image: {len(data)} bytes of {form.upper()} without a size'):
+        compressed_image_of(compressed(data, form))
+
+
+@pytest.mark.parametrize('ending', ['.tiff', '.bmp', '.webp', '.pgm'])
+def test_messages_with_other_pictures_are_not_even_decoded(ending, monkeypatch):
+    """A TIFF of 2 MB may have 900 million pixels, which nothing says before it is decoded."""
+    data = encoded(ending, GREY)
+    np.testing.assert_array_equal(decode(data).shape[:2], GREY.shape)
+    monkeypatch.setattr(cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
+    with pytest.raises(ValueError, match=f'not an image as JPEG or PNG: {len(data)} bytes that begin with b'):
+        compressed_image_of(compressed(data, 'tiff'))
+
+
 PICTURES = [encoded('.jpg', GREY), encoded('.png', GREY), bytes(12) + encoded('.png', DEPTH), huge('.png')]
 
 

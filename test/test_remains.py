@@ -1,5 +1,6 @@
 """Files of recordings that these tests write, and cut off or damage."""
 
+import bz2
 import re
 import shutil
 import sqlite3
@@ -7,7 +8,9 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+import lz4.frame
 import pytest
+import zstandard
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionMode
@@ -27,6 +30,7 @@ from test_recordings import (
     write_ros1,
 )
 
+from line_feature_node import remains as module
 from line_feature_node.remains import MCAP, kind_of, readable, remains
 
 FRAMES = 120
@@ -172,6 +176,15 @@ def test_a_damaged_chunk_is_left_out_and_those_behind_it_remain(tmp_path, name, 
     assert set(found) < set(whole)
     assert len(found) > 0.5 * len(whole)
     assert found[-1] == whole[-1]
+
+
+@pytest.mark.parametrize(('name', 'compress'), [
+    ('zstd', zstandard.compress), ('lz4', lz4.frame.compress), ('bz2', bz2.compress)])
+def test_what_is_small_and_would_be_beyond_all_measure_is_not_decompressed_to_its_end(name, compress, monkeypatch):
+    monkeypatch.setattr(module, 'LARGEST', 2**20)
+    bomb = compress(bytes(2**26))
+    assert len(bomb) < 2**19
+    assert 2**20 <= len(module._decompressed(name, bomb)) <= 2**21
 
 
 def test_noise_ends_it(recording):
