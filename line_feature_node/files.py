@@ -21,6 +21,11 @@ from line_feature_node.overlay import draw_overlay
 #: Files that are taken for images by their name, so that broken ones are reported.
 SUFFIXES = {'.avif', '.bmp', '.exr', '.gif', '.hdr', '.jp2', '.jpeg', '.jpg', '.pbm', '.pgm', '.png', '.pnm', '.ppm',
             '.tif', '.tiff', '.webp'}
+#: The variable of the environment with the folders, as in PATH, that files which parameters name must be in; where it
+#: is not set, or empty, they may be anywhere.
+FOLDERS = 'LINE_FEATURE_FOLDERS'
+#: No image file is larger.
+MOST_BYTES = 2**30
 #: How the name of an overlay ends.
 OVERLAY = '-overlay.png'
 
@@ -140,9 +145,17 @@ def _read(path: Path) -> NDArray[Any]:
     """An image file as an array; OSError or ValueError where that cannot be."""
     if os.path.isdir(path):
         raise ValueError('no image files in this folder')
+    return decode(_content(path))
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a file; OSError or ValueError where that cannot be, as of a device, which may have no end."""
     if os.path.exists(path) and not os.path.isfile(path):
         raise ValueError('not a regular file')
-    return decode(path.read_bytes())
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise ValueError(f'{size} bytes: expected {MOST_BYTES} at most')
+    return path.read_bytes()
 
 
 def _write(outcome: Outcome, image: NDArray[Any], extractor: LineFeatureExtractor) -> None:
@@ -166,15 +179,28 @@ def read_mask(path: Path) -> NDArray[np.uint8]:
     """A mask for images, H×W: 0 where the picture in a file is black.
 
     Raises:
-        ValueError: It cannot be read, or is no picture.
+        ValueError: It cannot be read, is no picture, or is where the operator allows none.
     """
     try:
-        mask = decode(path.read_bytes(), grey=True)
+        mask = decode(_content(_allowed(path)), grey=True)
     except OSError as error:
         raise ValueError(f'mask_file {path}: {error.strerror}') from None
     except ValueError as error:
         raise ValueError(f'mask_file {path}: {error}') from None
     return np.where(mask != 0, np.uint8(255), np.uint8(0))
+
+
+def _allowed(path: Path) -> Path:
+    """The place that a path leads to, links followed.
+
+    Raises:
+        ValueError: It is in none of FOLDERS.
+    """
+    place = Path(os.path.realpath(path))
+    folders = [folder for folder in os.environ.get(FOLDERS, '').split(os.pathsep) if folder]
+    if folders and not any(place.is_relative_to(os.path.realpath(folder)) for folder in folders):
+        raise ValueError(f'is {place}, and {FOLDERS} allows files in {", ".join(folders)} only')
+    return place
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:

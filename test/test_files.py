@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import cv2
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 
 from line_feature_node.core import LineFeatureExtractor, Parameters
-from line_feature_node.files import displayable, find_images, process
+from line_feature_node.files import FOLDERS, MOST_BYTES, displayable, find_images, process, read_mask
 
 STEP = np.repeat(np.where(np.arange(120) < 60, 40, 200).astype(np.uint8)[None], 90, 0)
 
@@ -72,3 +73,57 @@ def test_folders_are_read_in_order_and_files_taken_as_they_are(tmp_path):
 ])
 def test_displayable_shows_the_range_of_intensities(image, parameters, expected):
     assert displayable(image, parameters)[0].tolist() == expected
+
+
+@pytest.fixture
+def masks(tmp_path):
+    """Folders with a mask each, and one with links to them."""
+    for name in ('mine', 'mine-too', 'theirs'):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / 'mask.png'), STEP)
+    (tmp_path / 'links').mkdir()
+    for name in ('mine', 'theirs'):
+        (tmp_path / 'links' / f'{name}.png').symlink_to(tmp_path / name / 'mask.png')
+    return tmp_path
+
+
+@pytest.mark.parametrize('folders', [None, '', ':'])
+def test_masks_may_be_anywhere_unless_the_operator_names_folders(masks, monkeypatch, folders):
+    monkeypatch.delenv(FOLDERS, raising=False)
+    if folders is not None:
+        monkeypatch.setenv(FOLDERS, folders)
+    assert read_mask(masks / 'theirs' / 'mask.png').shape == STEP.shape
+
+
+@pytest.mark.parametrize(('path', 'allowed'), [
+    ('mine/mask.png', True), ('links/mine.png', True), ('theirs/../mine/mask.png', True), ('theirs/mask.png', False),
+    ('mine-too/mask.png', False), ('mine/../theirs/mask.png', False), ('links/theirs.png', False),
+    ('theirs/none.png', False)])
+def test_masks_are_read_from_the_folders_of_the_operator_alone(masks, monkeypatch, path, allowed):
+    monkeypatch.setenv(FOLDERS, f'{masks / "none"}:{masks / "mine"}')
+    if allowed:
+        assert read_mask(masks / path).shape == STEP.shape
+        return
+    with pytest.raises(ValueError, match=f'^mask_file {masks / path}: is {masks}/.*, and {FOLDERS} allows files in '
+                                         f'{masks / "none"}, {masks / "mine"} only$'):
+        read_mask(masks / path)
+
+
+def test_folders_of_the_operator_may_be_links_and_relative(masks, monkeypatch):
+    (masks / 'link').symlink_to(masks / 'mine')
+    monkeypatch.chdir(masks)
+    for folder in ('link', 'mine', '.'):
+        monkeypatch.setenv(FOLDERS, folder)
+        assert read_mask(Path('mine/mask.png')).shape == STEP.shape
+
+
+def test_what_may_have_no_end_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'large').touch()
+    os.truncate(tmp_path / 'large', MOST_BYTES + 1)
+    for path, reason in ((Path('/dev/zero'), 'not a regular file'), (tmp_path / 'pipe', 'not a regular file'),
+                         (tmp_path, 'not a regular file'), (tmp_path / 'large', '1073741825 bytes: expected')):
+        with pytest.raises(ValueError, match=f'mask_file {path}: {reason}'):
+            read_mask(path)
+    [outcome] = process([tmp_path / 'large'], tmp_path / 'out', Parameters())
+    assert outcome.error == '1073741825 bytes: expected 1073741824 at most'

@@ -29,6 +29,7 @@ from visualization_msgs.msg import ImageMarker
 
 from line_feature_node import node as node_module
 from line_feature_node.core import STEPS, LineFeatureExtractor, Parameters, end_points
+from line_feature_node.files import FOLDERS
 from line_feature_node.images import compressed_image_of
 from line_feature_node.messages import segments_of
 from line_feature_node.node import OUTPUTS, ConfigurationError, LineFeatureNode, spin
@@ -641,6 +642,14 @@ def test_mask_that_cannot_be_read_keeps_the_node_from_starting(bench, tmp_path, 
         path.write_bytes(content)
     with pytest.raises(ConfigurationError, match=f'mask_file {path}: '):
         bench.node(mask_file=str(path))
+
+
+def test_mask_outside_of_the_folders_of_the_operator_keeps_the_node_from_starting(bench, mask_file, monkeypatch):
+    monkeypatch.setenv(FOLDERS, str(mask_file.parent / 'masks'))
+    with pytest.raises(ConfigurationError, match=f'mask_file {mask_file}: .* allows files in '):
+        bench.node(mask_file=str(mask_file))
+    monkeypatch.setenv(FOLDERS, str(mask_file.parent))
+    assert bench.node(mask_file=str(mask_file))._mask is not None
 
 
 # Hints

@@ -34,6 +34,15 @@ def test_what_is_read_once_is_constant():
     assert constant == {'image_transport', 'mask_file', 'autostart'}
 
 
+def test_no_text_that_may_name_a_file_can_be_set_while_the_node_runs():
+    """Anybody may set what is not constant."""
+    for table in (Parameters(), Options()):
+        free = {name for name, spec in table.specs().items() if isinstance(getattr(table, name), str)
+                and not spec.choices}
+        assert free <= {'mask_file'}
+        assert all(table.specs()[name].constant for name in free)
+
+
 @pytest.mark.parametrize(('values', 'reason'), [
     ({'profile': 'none'}, 'profile must be one of default, '),
     ({'image_transport': 'theora'}, "image_transport must be one of raw, compressed, got 'theora'"),
