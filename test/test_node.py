@@ -5,6 +5,8 @@ import gc
 import re
 import threading
 import time
+from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -1267,3 +1269,51 @@ def test_node_that_was_destroyed_is_not_seen_any_more(bench):
         assert bench.peer.get_node_names() == ['peer']
     finally:
         gc.enable()
+
+
+# Who may do what
+
+POLICY = Path(__file__).resolve().parents[1] / 'config' / 'sros2' / 'line_feature_node.policy.xml'
+
+
+def allowed(tag, what):
+    """Names that the policy of SROS 2 allows, as its tools expand them for a node in the root namespace."""
+    [profile] = ElementTree.parse(POLICY).getroot().iterfind('enclaves/enclave/profiles/profile')
+    assert (profile.get('ns'), f'/{profile.get("node")}') == ('/', NAME)
+    names = [entry.text for group in profile.iterfind(f'{tag}s[@{what}="ALLOW"]') for entry in group.iterfind(tag)]
+    expanded = {name.replace('~', NAME) if name.startswith('~') else f'/{name.removeprefix("/")}' for name in names}
+    assert len(expanded) == len(names)
+    return expanded
+
+
+def graph(bench, end):
+    """What the node has, as others see it."""
+    look = getattr(bench.peer, f'get_{end}_names_and_types_by_node')
+    return {name for name, _ in look(NAME[1:], '/')}
+
+
+def test_the_policy_allows_what_the_node_has_and_nothing_else(bench):
+    found = {end: set() for end in ('subscriber', 'publisher', 'service', 'client')}
+    for transport in ('raw', 'compressed'):
+        node = bench.node(image_transport=transport, lazy=False, use_sim_time=True)
+        bench.until(lambda: len(graph(bench, 'subscriber')) == 2, 'subscriptions')
+        bench.until(lambda: allowed('topic', 'publish') <= graph(bench, 'publisher'), 'publishers')
+        bench.until(lambda: allowed('service', 'reply') <= graph(bench, 'service'), 'services')
+        for end, names in found.items():
+            names |= graph(bench, end)
+        bench.nodes.remove(node)
+        bench.executor.remove_node(node)
+        node.destroy_node()
+        bench.until(lambda: NAME[1:] not in bench.peer.get_node_names(), 'end of the node')
+    assert found == {
+        'subscriber': allowed('topic', 'subscribe'), 'publisher': allowed('topic', 'publish'),
+        'service': allowed('service', 'reply'), 'client': set()}
+
+
+def test_the_policy_has_the_form_of_the_tools():
+    policy = ElementTree.parse(POLICY).getroot()
+    assert (policy.tag, policy.attrib) == ('policy', {'version': '0.2.0'})
+    assert [enclave.get('path') for enclave in policy.iterfind('enclaves/enclave')] == [NAME]
+    [profile] = policy.iterfind('enclaves/enclave/profiles/profile')
+    assert [(group.tag, group.attrib) for group in profile] == [
+        ('topics', {'subscribe': 'ALLOW'}), ('topics', {'publish': 'ALLOW'}), ('services', {'reply': 'ALLOW'})]

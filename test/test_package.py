@@ -150,6 +150,50 @@ def imports(path):
             yield node.module
 
 
+#: What runs whatever code is in the data that it reads.
+RUNS_DATA = {'pickle', 'cPickle', 'dill', 'cloudpickle', 'joblib', 'marshal', 'shelve', 'jsonpickle'}
+RUNS_TEXT = {'eval', 'exec', 'compile', '__import__', 'system', 'popen'}
+
+
+def faults(source):
+    """What in a module could run code that somebody else sent or wrote."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
+            yield from (name for name in names if name and name.split('.')[0] in RUNS_DATA)
+        elif isinstance(node, ast.Call):
+            owner = node.func.value if isinstance(node.func, ast.Attribute) else None
+            name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, 'id', '')
+            of = owner.id if isinstance(owner, ast.Name) else ''
+            if name in RUNS_TEXT and of not in {'re', 'sre'}:
+                yield name
+            if of == 'yaml' and name not in {'safe_load', 'safe_dump'}:
+                yield f'yaml.{name}'
+            yield from (keyword.arg for keyword in node.keywords if keyword.arg in {'allow_pickle', 'shell'}
+                        and not (isinstance(keyword.value, ast.Constant) and keyword.value.value is False))
+
+
+MODULES = sorted((ROOT / 'line_feature_node').rglob('*.py'))
+
+
+@pytest.mark.parametrize('path', MODULES, ids=[path.stem for path in MODULES])
+def test_nothing_runs_what_it_reads(path):
+    assert list(faults(path.read_text(encoding='utf-8'))) == []
+
+
+@pytest.mark.parametrize('source', [
+    'import pickle', 'from pickle import load', 'import cloudpickle.x', 'eval(text)', 'exec(text)', 'os.system(text)',
+    'yaml.load(text)', 'yaml.load_all(text, yaml.Loader)', 'yaml.unsafe_load(text)', 'np.load(path, allow_pickle=True)',
+    'run(text, shell=yes)', 'builtins.eval(text)'])
+def test_what_runs_what_it_reads_would_be_found(source):
+    assert len(list(faults(source))) == 1
+
+
+def test_every_requirement_says_from_which_version_on():
+    for line in importlib.metadata.requires('line_feature_node'):
+        assert re.match(r'[\w-]+(\[\w+\])?>=\d', line), line
+
+
 @pytest.mark.parametrize('path', sorted((ROOT / 'line_feature_node' / 'core').glob('*.py')), ids=lambda path: path.name)
 def test_core_knows_nothing_of_the_world(path):
     allowed = {'cv2', 'numpy', 'numba', 'llvmlite', *sys.stdlib_module_names}
