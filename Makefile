@@ -1,5 +1,5 @@
-# make install, demo, test, test-all, lint, colcon, bench, bench-node, bench-bag: everything goes into .venv, or
-# .venv-3.10 and so on for test-all; nothing asks anything.
+# make install, demo, test, test-all, lint, colcon, bench, bench-node, bench-bag, soak-bag, audit: everything goes into
+# .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,6 +12,8 @@ YORK ?=
 EXTRA := $(if $(filter x86_64,$(shell uname -m)),ros)
 # opencv-contrib, which has EdgeDrawing, cannot be where OpenCV is.
 PEERS := .venv-peers
+# What the package needs, without ROS 2, which comes from a distribution that says itself what is wrong with it.
+AUDIT := .venv-audit
 
 # Docstring codes that ament_pep257 leaves out: its own convention forbids the summary on the first line, so ours is what
 # remains of all its codes without these.
@@ -22,7 +24,7 @@ PEERS := .venv-peers
 #   D417            arguments that belong together are described together
 PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
 
-.PHONY: install demo test test-all lint colcon bench bench-node bench-bag docs clean
+.PHONY: install demo test test-all lint colcon bench bench-node bench-bag soak-bag audit docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -59,12 +61,22 @@ bench-node: $(PEERS)/.installed
 bench-bag: install
 	$(BIN)/python bench/bag.py --results bench/results
 
+# Runs over recordings that are killed or lack something, and resumed: half an hour. Figures are in docs/reliability.md.
+soak-bag: install
+	$(BIN)/python bench/kills.py
+
+# Versions that are known to be weak. It fails where the package index has no list of these (--strict): finding nothing
+# there means nothing.
+audit: $(AUDIT)/.installed
+	$(AUDIT)/bin/python -m pip freeze --exclude line_feature_node >$(AUDIT)/versions.txt
+	$(AUDIT)/bin/pip-audit --strict --no-deps --disable-pip --requirement $(AUDIT)/versions.txt
+
 # The tables in the README, the files of config/, and the pictures in docs/.
 docs: install
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf $(VENV) $(PEERS) .venv-3.* build/colcon
+	rm -rf $(VENV) $(PEERS) $(AUDIT) .venv-3.* build/colcon
 
 # Where Debian's python3-venv is missing, a folder without pip is left behind: it must not pass for an environment.
 $(BIN)/python:
@@ -78,6 +90,11 @@ $(PEERS)/.installed: bench/requirements.txt setup.py package.xml
 	$(PYTHON) -m venv $(PEERS)
 	$(PEERS)/bin/python -m pip install --quiet --requirement bench/requirements.txt
 	$(PEERS)/bin/python -m pip install --quiet --no-deps --editable .
+	touch $@
+
+$(AUDIT)/.installed: setup.py package.xml
+	$(PYTHON) -m venv $(AUDIT)
+	$(AUDIT)/bin/python -m pip install --quiet '.[fleet]' 'pip-audit>=2.7'
 	touch $@
 
 $(VENV)/.test: $(VENV)/.installed

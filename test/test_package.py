@@ -13,6 +13,8 @@ import pytest
 import yaml
 
 from line_feature_node.core import SEGMENT_DTYPE, Parameters
+from line_feature_node.files import FOLDERS
+from line_feature_node.images import MOST_PIXELS
 from line_feature_node.options import Options
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -187,6 +189,16 @@ def test_nothing_runs_what_it_reads(path):
     'run(text, shell=yes)', 'builtins.eval(text)'])
 def test_what_runs_what_it_reads_would_be_found(source):
     assert len(list(faults(source))) == 1
+
+
+def test_security_md_names_what_the_node_has():
+    said = (ROOT / 'SECURITY.md').read_text(encoding='utf-8')
+    constant = [name for name, spec in Options.specs().items() if spec.constant]
+    row = next(line for line in said.splitlines() if line.startswith('| parameters |'))
+    assert {name for name in re.findall(r'`(\w+)`', row) if name in Options.specs()} == set(constant)
+    assert f'`{FOLDERS}=' in said
+    assert MOST_PIXELS == 2**28
+    assert '2^28 pixels' in said
 
 
 def test_every_requirement_says_from_which_version_on():
