@@ -322,7 +322,8 @@ def align_to_peaks(
     turn = (std - float(st) * sd / n) / moment
     shift = (sd - turn * st) / n
     line['response'] = response / (high - low + 1)
-    line['variance'] = max(sdd - shift * sd - turn * std, 0.0) / max(n - 2, 1)
+    residual = float(sdd - shift * sd - turn * std)
+    line['variance'] = max(residual, 0.0) / max(n - 2, 1)
     line['size'], line['moment'] = n, moment
     return nudge(line, shift, turn, middle, move)
 
@@ -415,7 +416,7 @@ def end_of(
     window, earlier, found = 0.0, 2 * END * before, float(place)
     step = base
     while True:
-        value = ZERO
+        value: Any = ZERO
         if nearest <= step <= farthest:
             p = way * step
             value = support(slope * p + intercept, gradient, in_p + p * step_p, in_q + p * step_p, step_q, np_, nq,
