@@ -6,7 +6,6 @@ a chain goes round a corner or wanders, is in no stretch. The cost of pixels is 
 their line, in units of the variance that whole pixels and noise give them. The line-blobs are the stretches.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,8 @@ from line_feature_node.core.scanning import Chains
 UNIT, FIRST, LONGEST = 4, 3, 32
 #: The largest cost of the units that a stretch begins with, and the cost of a unit that is left out.
 STRAIGHT, LEFT_OUT = 10.0, 6.0
+#: The scatter of two pixels beside each other: that of one pixel would be divided by nothing.
+LEAST_TRACE = 0.5
 #: Standard deviation, in pixels, of the distance of whole pixels from the line that they follow, and of the noise in
 #: that where the gradient is as strong as the noise of its components.
 DEVIATION, NOISE_DEVIATION = 0.5, 2.0
@@ -116,15 +117,17 @@ def sum_up(first: int, size: int, pixels: Any, bridged: Any, stride: int, margin
 
 @inlined
 def scatter(sums: Any, first: int, last: int) -> float:
-    """Sum of squared distances of the pixels of some units from their line: the smaller eigenvalue of their scatter."""
+    """Sum of squared distances of the pixels of some units from their line: the smaller eigenvalue of their scatter.
+
+    It is taken as the determinant over the trace, which is that but for the share that it has of the larger one.
+    """
     n = sums[last, 0] - sums[first, 0]
-    if n < 2:
-        return 0.0
+    per_pixel = 1 / max(n, 1.0)
     x, y = sums[last, 1] - sums[first, 1], sums[last, 2] - sums[first, 2]
-    xx = sums[last, 3] - sums[first, 3] - x * x / n
-    xy = sums[last, 4] - sums[first, 4] - x * y / n
-    yy = sums[last, 5] - sums[first, 5] - y * y / n
-    return max(0.5 * (xx + yy - math.sqrt((xx - yy) * (xx - yy) + 4 * xy * xy)), 0.0)
+    xx = sums[last, 3] - sums[first, 3] - x * x * per_pixel
+    xy = sums[last, 4] - sums[first, 4] - x * y * per_pixel
+    yy = sums[last, 5] - sums[first, 5] - y * y * per_pixel
+    return max(xx * yy - xy * xy, 0.0) / max(xx + yy, LEAST_TRACE)
 
 
 @kernel
