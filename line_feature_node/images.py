@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from line_feature_node import MOST_PIXELS
 from line_feature_node.core import Parameters
 from line_feature_node.core.edges import intensity_map
 
@@ -18,13 +19,13 @@ JPEG, JPEG_SCAN, JPEG_END = b'\xff\xd8\xff', 0xDA, b'\xff\xd9'
 JPEG_MARKER = re.compile(rb'\xff+([^\x00\xff])', re.DOTALL)
 #: Markers without a length: TEM, and RST0 to RST7.
 JPEG_BARE = {0x01, *range(0xD0, 0xD8)}
-PNG, PNG_END = b'\x89PNG', b'IEND\xaeB`\x82'
+PNG, PNG_END = b'\x89PNG', b'IEND'
+#: Bytes of a chunk besides its content: length, name and checksum.
+PNG_CHUNK = 12
 #: Markers of a JPEG that announce its size: all of SOF0 to SOF15 but the tables DHT, JPG and DAC among them.
 JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 #: Bytes before the picture in a compressed depth image: format, and two numbers that map inverse depth to 16 bits.
 DEPTH_HEADER = struct.Struct('<iff')
-#: A picture with more pixels is not decoded: its header may say anything, and memory would be had for it.
-MOST_PIXELS = 2**28
 
 #: Grey levels between the darkest and the brightest pixel of a picture that uses hardly any of its range.
 FAINT = 16.0
@@ -193,7 +194,17 @@ def _is_whole(data: bytes) -> bool:
     """
     if data.startswith(JPEG):
         return JPEG_END in data[_jpeg_header(data)[0]:]
-    return not data.startswith(PNG) or PNG_END in data
+    return not data.startswith(PNG) or _has_all_chunks(data)
+
+
+def _has_all_chunks(data: bytes) -> bool:
+    """Whether the chunks of a PNG are there to the last: OpenCV makes room for what the length of one claims."""
+    place, name = 8, b''
+    while name != PNG_END and place + PNG_CHUNK <= len(data):
+        length = int.from_bytes(data[place:place + 4], 'big')
+        name = data[place + 4:place + 8]
+        place += PNG_CHUNK + length
+    return name == PNG_END and place <= len(data)
 
 
 def _announced_size(data: bytes) -> tuple[int, int]:
@@ -264,5 +275,7 @@ def displayable(image: NDArray[Any], parameters: Parameters) -> NDArray[np.uint8
     scale, offset = intensity_map(image.dtype, parameters)
     if image.dtype == np.uint8 and (scale, offset) == (1, 0):
         return image
-    levels = np.nan_to_num(scale * image.astype(np.float32) + offset, copy=False, nan=0, posinf=0, neginf=0)
+    with np.errstate(invalid='ignore', over='ignore'):  # of what is not finite, or will not be
+        levels = scale * image.astype(np.float32) + offset
+    levels = np.nan_to_num(levels, copy=False, nan=0, posinf=0, neginf=0)
     return np.asarray(np.clip(levels, 0, 255), np.uint8)

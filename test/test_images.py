@@ -2,6 +2,8 @@ import array
 import itertools
 import re
 import struct
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import cv2
@@ -550,3 +552,52 @@ def test_big_endian_pixels_are_shown_as_they_are_meant():
     np.testing.assert_array_equal(
         displayable(image_of(message_of(pixels, 'mono16', big=True)), Parameters()),
         displayable(image_of(message_of(pixels, 'mono16', big=False)), Parameters()))
+
+
+# Headers that claim what is not there
+
+def with_filling(data, filling):
+    """With something between the first block and the second."""
+    place = 4 + int.from_bytes(data[4:6], 'big')
+    return data[:place] + filling + data[place:]
+
+
+@pytest.mark.parametrize('filling', [b'', b'\xff', b'\xff\xff\xff', b'\0', b'abc', b'\xff\0'])
+def test_the_size_of_a_jpeg_is_found_behind_filling(filling):
+    """Decoders skip it, so what a header behind it claims counts."""
+    data = bytearray(cv2.imencode('.jpg', PICTURE)[1].tobytes())
+    np.testing.assert_array_equal(decode(with_filling(bytes(data), filling)), decode(bytes(data)))
+    place = data.index(b'\xff\xc0') + 5
+    data[place:place + 4] = struct.pack('>HH', 30_000, 30_000)
+    with pytest.raises(ValueError, match='an image of 30000×30000 pixels: expected'):
+        decode(with_filling(bytes(data), filling))
+
+
+@pytest.mark.parametrize('length', [2**28, 2**31 - 13, 2**31, 2**32 - 1])
+@pytest.mark.parametrize('place', [33, 8])
+def test_a_png_whose_chunk_claims_more_than_there_is_is_a_part(length, place):
+    """OpenCV would have, and fill, memory of that size for it."""
+    data = cv2.imencode('.png', PICTURE)[1].tobytes()
+    data = data[:place] + struct.pack('>I', length) + data[place + 4:]
+    with pytest.raises(ValueError, match='a part of an image'):
+        decode(data)
+
+
+def test_other_formats_have_the_same_limit():
+    """OpenCV reads it when it is loaded: in the package's own processes, that is."""
+    program = """
+import line_feature_node
+import cv2, numpy
+data = bytearray(cv2.imencode('.bmp', numpy.zeros((4, 4), numpy.uint8))[1].tobytes())
+data[18:26] = (30_000).to_bytes(4, 'little') * 2
+from line_feature_node.images import decode
+decode(bytes(data))
+"""
+    ended = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=False)
+    assert 'ValueError: OpenCV cannot decode the image: pixels <= CV_IO_MAX_IMAGE_PIXELS' in ended.stderr
+
+
+def test_what_is_not_finite_is_shown_without_a_warning():
+    signalling = np.array([[0x7f800001, 0x7f7fffff, 0xff800000]], np.uint32).view(np.float32)
+    shown = displayable(signalling, Parameters(intensity_min=0.0, intensity_max=1e-3))
+    np.testing.assert_array_equal(shown, [[0, 0, 0]])
