@@ -521,3 +521,27 @@ def test_paper_does_not_depend_on_noise() -> None:
     ({'refine': True, 'grouping': 'straightness'}, False)], ids=str)
 def test_adaptive_is_what_depends_on_the_noise(given: dict[str, Any], expected: bool) -> None:
     assert Parameters.profile('paper', **given).adaptive is expected
+
+
+@pytest.mark.parametrize('value', [10**400, -10**400, 16**5000], ids=['large', 'small', 'unwritable'])
+@pytest.mark.parametrize('name', ['alpha', 'T1', 'n', 'intensity_max'])
+def test_number_beyond_every_float_is_refused(name: str, value: int) -> None:
+    with pytest.raises(ValueError, match=f'^{name} must be .*, got ') as caught:
+        Parameters(**{name: value})
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(('name', 'value'), [('operator', 'x' * 10**6), ('roi', [1.0] * 10**5), ('refine', 'y' * 999)],
+                         ids=['text', 'list', 'flag'])
+def test_value_of_any_size_is_named_in_part(name: str, value: Any) -> None:
+    expected = rf'^{name} must be .*, got .*\.\.\. \(\d+ characters\)$'
+    with pytest.raises((TypeError, ValueError), match=expected) as caught:
+        Parameters(**{name: value})
+    assert len(str(caught.value)) < 500
+
+
+def test_number_of_few_bits_is_compared_as_it_is() -> None:
+    """In the half precision of the value the range of the parameter would be infinite, with a warning."""
+    assert Parameters(intensity_max=np.float16(0.5)).intensity_max == 0.5
+    with pytest.raises(ValueError, match='^T1 must be 0 to 1000'):
+        Parameters(T1=np.float16(2000))

@@ -17,6 +17,8 @@ Self = TypeVar('Self', bound='ParameterSet')  # typing has it from Python 3.11 o
 
 #: Just beyond a right angle, so that what is rounded to four digits is in range.
 RIGHT_ANGLE = 1.5708
+#: Characters of a wrong value that a message has.
+LONGEST = 200
 
 
 @dataclass(frozen=True)
@@ -225,8 +227,17 @@ class Parameters(ParameterSet):
             TypeError: As the class raises.
         """
         if not isinstance(name, str) or name not in PROFILES:
-            raise ValueError(f'profile must be one of {", ".join(PROFILES)}, got {name!r}')
+            raise ValueError(f'profile must be one of {", ".join(PROFILES)}, got {shown(name)}')
         return cls.of({**PROFILES[name].values, **parameters})
+
+
+def shown(value: Any) -> str:
+    """A value that is wrong, as a message names it; it may be of any size."""
+    try:
+        text = repr(value).replace('\n', ' ')
+    except (RecursionError, ValueError):  # nor does Python write a number of thousands of digits
+        return f'{type(value).__name__} beyond all measure'
+    return text if len(text) <= LONGEST else f'{text[:LONGEST]}... ({len(text)} characters)'
 
 
 def _checked(field: 'dataclasses.Field[Any]', value: Any) -> Any:
@@ -238,13 +249,13 @@ def _checked(field: 'dataclasses.Field[Any]', value: Any) -> Any:
         return _checked_text(field.name, spec, value)
     if isinstance(field.default, bool):
         if not isinstance(value, bool | np.bool_):
-            raise TypeError(f'{field.name} must be true or false, got {value!r}')
+            raise TypeError(f'{field.name} must be true or false, got {shown(value)}')
         return bool(value)
     return _checked_number(field.name, spec, value, whole=isinstance(field.default, int))
 
 
 def _checked_text(name: str, spec: Spec, value: Any) -> str:
-    expected = f'{name} must be {"one of " + spec.range if spec.choices else "a text"}, got {value!r}'
+    expected = f'{name} must be {"one of " + spec.range if spec.choices else "a text"}, got {shown(value)}'
     if not isinstance(value, str):
         raise TypeError(expected)
     if spec.choices and value not in spec.choices:
@@ -256,9 +267,9 @@ def _checked_list(name: str, spec: Spec, value: Any, size: int) -> tuple[float, 
     if isinstance(value, np.ndarray | array.array):
         value = value.tolist()
     if isinstance(value, str | bytes | bytearray | memoryview) or not isinstance(value, Sequence):
-        raise TypeError(f'{name} must be a list of {size} numbers, got {value!r}')
+        raise TypeError(f'{name} must be a list of {size} numbers, got {shown(value)}')
     if len(value) != size:
-        raise ValueError(f'{name} must be a list of {size} numbers, got {len(value)}: {list(value)}')
+        raise ValueError(f'{name} must be a list of {size} numbers, got {len(value)}: {shown(list(value))}')
     return tuple(_checked_number(f'each number of {name}', spec, number, whole=False) for number in value)
 
 
@@ -266,8 +277,9 @@ def _checked_number(name: str, spec: Spec, value: Any, *, whole: bool) -> float:
     unit = spec.unit and f' {spec.unit}'
     if not isinstance(value, numbers.Integral if whole else numbers.Real) or isinstance(value, bool):
         raise TypeError(f'{name} must be {"a whole number" if whole else "a number"} of {spec.range}{unit}, '
-                        f'got {value!r}')
-    number: Any = value
-    if not (spec.low <= number <= spec.high or (spec.unset and math.isnan(number))):
-        raise ValueError(f'{name} must be {spec.range}{unit}, got {value!r}')
+                        f'got {shown(value)}')
+    # Numpy compares in the type of its number, in which the range may be infinite.
+    number: Any = value.item() if isinstance(value, np.generic) else value
+    if not (spec.low <= number <= spec.high or (spec.unset and number != number)):
+        raise ValueError(f'{name} must be {spec.range}{unit}, got {shown(value)}')
     return int(number) if whole else float(number)
