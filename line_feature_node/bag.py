@@ -22,7 +22,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from rosbags.interfaces import (
     Connection,
     MessageDefinitionFormat,
@@ -55,6 +54,7 @@ from line_feature_node.recordings import (
 )
 from line_feature_node.slices import CSV, Frame, Job, process_slice, rests, unpack
 from line_feature_node.workers import Workers, in_order, inline
+from line_feature_node.yaml_text import parsed
 
 #: What is offered with results, as the node does: reliable, of depth 5.
 QOS = Qos(QosHistory.KEEP_LAST, 5, QosReliability.RELIABLE, QosDurability.VOLATILE, QosTime(0, 0), QosTime(0, 0),
@@ -237,8 +237,8 @@ def _not_of_a_bag(path: Path) -> str:
 
 def _describes_a_bag(metadata: Path) -> bool:
     try:
-        content = yaml.safe_load(metadata.read_text(encoding='utf-8'))
-    except (OSError, RecursionError, ValueError, yaml.YAMLError):
+        content = parsed(metadata.read_text(encoding='utf-8'))
+    except (OSError, ValueError):
         return False
     return isinstance(content, dict) and 'rosbag2_bagfile_information' in content
 

@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from line_feature_node.core import Parameters
+from line_feature_node.core.parameters import shown
 from line_feature_node.options import QOS_OVERRIDES, Options
+from line_feature_node.yaml_text import parsed
 
 
 def read_parameter_file(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -23,25 +23,20 @@ def read_parameter_file(path: Path) -> tuple[dict[str, Any], list[str]]:
         ValueError: It cannot be read, or is no such file; the message is a sentence.
     """
     try:
-        return _read(path)
-    except RecursionError:
-        raise ValueError(f'{path}: what it says contains itself, or is nested too deep') from None
-
-
-def _read(path: Path) -> tuple[dict[str, Any], list[str]]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+        content = parsed(path.read_text(encoding='utf-8'), aliases=False)
     except OSError as error:
         raise ValueError(f'{path}: {error.strerror}') from None
-    except (ValueError, yaml.YAMLError) as error:  # not UTF-8, or a date that does not exist
-        raise ValueError(f'{path}: not YAML ({" ".join(str(error).split())})') from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f'{path}: not YAML ({error})') from None
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
     sections = [section['ros__parameters'] for section in _sections(content)]
     if not sections:
         raise ValueError(f'{path}: no ros__parameters in it, as parameter files of ROS 2 have them')
     values: dict[str, Any] = {}
     for section in sections:
         if not isinstance(section, dict):
-            raise ValueError(f'{path}: ros__parameters must be names with values, got {section!r}')
+            raise ValueError(f'{path}: ros__parameters must be names with values, got {shown(section)}')
         values.update(_flattened(section))
     known = {*Parameters.specs(), *Options.specs()}
     return ({name: value for name, value in values.items() if name in known},

@@ -7,13 +7,13 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import yaml
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys.msg import normalize_msgtype
 
 from line_feature_node.recordings import METADATA, SALVAGE, SALVAGED, TOLD, RecordingError, Salvage
 from line_feature_node.remains import MCAP, ROS1, SQLITE3, ZSTD, Channel, Message, kind_of, readable, remains
+from line_feature_node.yaml_text import parsed
 
 
 @contextlib.contextmanager
@@ -85,10 +85,9 @@ def _parts(source: Path, damage: list[str]) -> list[Path]:
         return [source]
     listed: list[str] = []
     try:
-        with (source / METADATA).open(encoding='utf-8') as file:
-            information = yaml.safe_load(file)['rosbag2_bagfile_information']
+        information = parsed((source / METADATA).read_text(encoding='utf-8'))['rosbag2_bagfile_information']
         listed = [Path(name).name for name in information['relative_file_paths']]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError):
+    except (OSError, ValueError, KeyError, TypeError):
         damage.append(f'{METADATA} cannot be read')
     present = {path.name for path in source.iterdir()
                if path.is_file() and kind_of(path) in (MCAP, SQLITE3, ZSTD)}

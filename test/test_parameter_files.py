@@ -39,7 +39,7 @@ def test_nested_names_are_joined_by_points(tmp_path):
 
 
 @pytest.mark.parametrize(('text', 'reason'), [
-    ('a: &a {ros__parameters: {}, b: *a}\nc: &c {d: *c}', 'contains itself'),
+    ('a: &a {ros__parameters: {}, b: *a}\nc: &c {d: *c}', 'alias'),
     ('a: {ros__parameters: {day: 2024-13-45}}', 'not YAML'), ('T1: 5', 'no ros__parameters'),
     ('', 'no ros__parameters'), ('[1, 2]', 'no ros__parameters'),
     ('a: {ros__parameters: 5}', 'must be names with values, got 5'), ('a: [', 'not YAML'), ('\xff\x00', 'not YAML')])
@@ -77,10 +77,28 @@ def test_a_folder_is_a_sentence(tmp_path):
         read_parameter_file(tmp_path)
 
 
-@pytest.mark.parametrize('content', [
-    'a: &a\n  b: *a\n', 'a: {ros__parameters: &a {b: *a}}', '[' * 5000, 'a: {ros__parameters: ' + '{b: ' * 5000])
-def test_what_contains_itself_or_is_nested_without_end_is_a_sentence(tmp_path, content):
+@pytest.mark.parametrize(('content', 'reason'), [
+    ('a: &a\n  b: *a\n', 'is an alias'), ('a: {ros__parameters: &a {b: *a}}', 'is an alias'),
+    ('[' * 5000 + ']' * 5000, 'nested too deep'), ('a: ' + '{b: ' * 5000 + '}' * 5000, 'nested too deep')])
+def test_what_contains_itself_or_is_nested_without_end_is_a_sentence(tmp_path, content, reason):
     path = tmp_path / 'some.yaml'
     path.write_text(content)
-    with pytest.raises(ValueError, match='contains itself, or is nested too deep'):
+    with pytest.raises(ValueError, match=reason):
         read_parameter_file(path)
+
+
+def test_what_would_be_gigabytes_is_refused_before_it_is(tmp_path):
+    path = tmp_path / 'some.yaml'
+    lines = ['a0: &a0 {ros__parameters: {alpha: 1.0}}', *(
+        f'a{level}: &a{level} {{x: *a{level - 1}, y: *a{level - 1}}}' for level in range(1, 60))]
+    path.write_text('\n'.join(lines))
+    with pytest.raises(ValueError, match='a0 is an alias'):
+        read_parameter_file(path)
+
+
+def test_a_section_that_is_a_long_text_is_named_in_part(tmp_path):
+    path = tmp_path / 'some.yaml'
+    path.write_text(f'a: {{ros__parameters: {"x" * 10_000}}}')
+    with pytest.raises(ValueError, match=r"got 'xxx.*\.\.\. \(10002 characters\)") as caught:
+        read_parameter_file(path)
+    assert len(str(caught.value)) < 500

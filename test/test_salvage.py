@@ -105,7 +105,9 @@ def test_of_a_split_recording_the_other_parts_are_left(tmp_path, storage, wrong)
     assert any(middle.name in reason for reason in found.damage)
 
 
-@pytest.mark.parametrize('content', [None, '', '{', 'a: &a [*a]', 'rosbag2_bagfile_information: 5', '\0\1\2'])
+@pytest.mark.parametrize('content', [
+    None, '', '{', 'a: &a [*a]', 'rosbag2_bagfile_information: 5', '\0\1\2', '!!int ""', '!!timestamp x',
+    '1:' * 200 + '1.5'])
 def test_parts_are_found_without_metadata(tmp_path, content):
     source = write_split(tmp_path / 'rec', [film(2, first=2 * number) for number in range(11)])
     for number, path in enumerate(storages(source)):
