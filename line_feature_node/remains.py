@@ -39,6 +39,8 @@ PIECE = 2**16
 FULL = (errno.EDQUOT, errno.EFBIG, errno.ENOSPC)
 #: How a database is opened that is not to be changed, and is not.
 READ_ONLY = 'mode=ro&immutable=1'
+#: What libraries make of bytes that are none of theirs, lengths without measure among them.
+NONSENSE = (McapError, MemoryError, OverflowError, ValueError, struct.error)
 #: Rows that cannot be read are skipped in steps that double, up to this.
 LARGEST_STEP = 2**24
 
@@ -166,7 +168,7 @@ class _Channels:
         """Learn them from the end of the file, where that is there: the chunk that has them may be damaged."""
         try:
             summary = make_reader(file).get_summary()
-        except (McapError, ValueError, OSError, struct.error):
+        except (*NONSENSE, OSError):
             return
         for schema in summary.schemas.values() if summary else ():
             self._schemas[schema.id] = schema.name, schema.encoding, schema.data.decode(errors='replace')
@@ -187,7 +189,7 @@ class _Channels:
                 number, _, stamp, _ = MESSAGE.unpack_from(content)
                 if number in self._channels:
                     yield Message(self._channels[number], stamp, _inflated(content[MESSAGE.size:]))
-        except (McapError, ValueError, struct.error):
+        except NONSENSE:
             damage.append(f'{name} has a record that makes no sense')
 
     def _add(self, number: int, schema: int, topic: str, encoding: str, properties: dict[str, str]) -> None:
@@ -202,7 +204,7 @@ def _of_chunk(
 ) -> Iterator[Message]:
     try:
         chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
-    except (McapError, ValueError, struct.error):  # cut off before its messages
+    except NONSENSE:  # cut off before its messages
         return
     data = _decompressed(chunk.compression, chunk.data)
     wrong = len(data) != chunk.uncompressed_size or (
@@ -358,16 +360,20 @@ def _sqlite3(path: Path, folder: Path, damage: list[str]) -> Iterator[Message]:
 def _rows(path: Path, options: str, damage: list[str], name: str = '') -> Iterator[Message]:
     name = name or path.name
     database = sqlite3.connect(f'file:{quote(str(path))}?{options}', uri=True)
+    # A letter that is wrong in a definition is not worth the messages.
+    database.text_factory = lambda text: text.decode(errors='replace')
     try:
         # Or a file that is shorter than it says is not read at all.
         database.execute('PRAGMA writable_schema = ON')
-        channels = _topics(database)
+        channels = _topics(database, name, damage)
         last, step = -1, 0
         while step < LARGEST_STEP:
             errors: list[str] = []
             for number, topic, stamp, data in _rows_behind(database, last + step, errors):
                 last, step = number, 0
-                if topic in channels and isinstance(data, bytes):
+                if not isinstance(stamp, int) or stamp < 0:
+                    damage.append(f'{name} has a stamp that makes no sense in row {number}')
+                elif topic in channels and isinstance(data, bytes):
                     yield Message(channels[topic], stamp, _inflated(data))
             if not errors:
                 return
@@ -375,7 +381,7 @@ def _rows(path: Path, options: str, damage: list[str], name: str = '') -> Iterat
                 damage.append(f'{name}: {errors[0]} after row {last}')
             step = 2 * step or 1
     except sqlite3.Error as error:
-        damage.append(f'{name}: {error}')
+        damage.append(f'{name}: {" ".join(str(error).split())}')
     finally:
         database.close()
 
@@ -391,24 +397,29 @@ def _rows_behind(
         errors.append(str(error))
 
 
-def _topics(database: sqlite3.Connection) -> dict[int, Channel]:
+def _topics(database: sqlite3.Connection, name: str, damage: list[str]) -> dict[int, Channel]:
     """Topics by their number, of whatever version of the format: columns that it lacks are left out."""
     definitions: dict[str, tuple[str, str]] = {}
-    tables = {name for name, in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    tables = {table for table, in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if 'message_definitions' in tables:
         for msgtype, kind, text in database.execute(
                 'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'):
-            definitions[msgtype] = text, kind
+            if isinstance(text, str) and isinstance(kind, str):
+                definitions[msgtype] = text, kind
     rows = database.execute('SELECT * FROM topics')
-    names = [column[0] for column in rows.description]
+    columns = [column[0] for column in rows.description]
     channels = {}
     for row in rows:
-        values = dict(zip(names, row, strict=True))
-        text, kind = definitions.get(values['type'], ('', ''))
-        properties = [('offered_qos_profiles', values.get('offered_qos_profiles') or ''),
-                      ('topic_type_hash', values.get('type_description_hash') or '')]
-        channels[values['id']] = Channel(values['name'], values['type'], text, kind,
-                                         tuple((key, value) for key, value in properties if value))
+        values = dict(zip(columns, row, strict=True))
+        number, topic, msgtype = (values.get(column) for column in ('id', 'name', 'type'))
+        if not (isinstance(number, int) and isinstance(topic, str) and isinstance(msgtype, str)):
+            damage.append(f'{name} has a topic that makes no sense')
+            continue
+        text, kind = definitions.get(msgtype, ('', ''))
+        properties = [('offered_qos_profiles', values.get('offered_qos_profiles')),
+                      ('topic_type_hash', values.get('type_description_hash'))]
+        channels[number] = Channel(topic, msgtype, text, kind,
+                                   tuple((key, value) for key, value in properties if value and isinstance(value, str)))
     return channels
 
 

@@ -231,6 +231,86 @@ def test_what_was_not_yet_taken_over_from_the_log_of_sqlite3_remains(tmp_path):
     assert not list(tmp_path.glob('pages*'))
 
 
+def changed(tmp_path, *statements):
+    """A recording of sqlite3 after some SQL."""
+    path = make(tmp_path, 'sqlite3')
+    database = sqlite3.connect(path)
+    with database:
+        for statement in statements:
+            database.execute(statement)
+    database.close()
+    return path
+
+
+@pytest.mark.parametrize('stamp', ["'noon'", '-1', '4.0e300', "x'00'"])
+def test_rows_with_stamps_that_make_no_sense_are_left_out(tmp_path, stamp):
+    path = changed(tmp_path, f'UPDATE messages SET timestamp = {stamp} WHERE id = 2')
+    found, damage = left(path)
+    assert len(found) == 2 * FRAMES - 1
+    assert damage == ['rec.db3 has a stamp that makes no sense in row 2']
+
+
+@pytest.mark.parametrize('change', ["name = x'2f61'", 'name = 5.5', "type = x'00'", 'type = zeroblob(9)'])
+def test_topics_that_make_no_sense_are_left_out(tmp_path, change):
+    path = changed(tmp_path, f'UPDATE topics SET {change} WHERE id = 1')
+    found, damage = left(path)
+    if change == 'name = 5.5':  # the column makes a text of it
+        assert {topic for topic, _, _ in found} == {'5.5', '/words'}
+        return
+    assert {topic for topic, _, _ in found} == {'/words'}
+    assert damage == ['rec.db3 has a topic that makes no sense']
+
+
+@pytest.mark.parametrize('column', ['id', 'name', 'type'])
+def test_topics_without_a_column_are_left_out(tmp_path, column):
+    found, damage = left(changed(tmp_path, f'ALTER TABLE topics RENAME COLUMN {column} TO other'))
+    assert not found
+    assert set(damage) == {'rec.db3 has a topic that makes no sense'}
+
+
+def test_a_wrong_letter_in_a_definition_costs_no_message(tmp_path):
+    path = changed(
+        tmp_path, "UPDATE message_definitions SET encoded_message_definition = CAST(x'610aff' AS TEXT)",
+        "UPDATE topics SET offered_qos_profiles = x'ff'")
+    found, damage = left(path)
+    assert (len(found), damage) == (2 * FRAMES, [])
+
+
+def test_what_sqlite_says_is_one_line(tmp_path):
+    _, damage = left(changed(tmp_path, 'ALTER TABLE messages RENAME TO "a\nb"'))
+    assert damage
+    assert not any('\n' in words for words in damage)
+
+
+def test_a_chunk_that_claims_more_than_there_can_be_is_stepped_over(tmp_path):
+    """Its length is followed by two stamps, a size, a checksum and a name, before the length of what is in it."""
+    path = make(tmp_path, 'mcap of small chunks')
+    data = bytearray(path.read_bytes())
+    place = next(place for op, place in records_of(data) if op == 6)
+    place += 28 + 4 + int.from_bytes(data[place + 28:place + 32], 'little')
+    data[place:place + 8] = b'\xff' * 8
+    path.write_bytes(data)
+    assert FRAMES < len(left(path)[0]) < 2 * FRAMES
+
+
+def test_a_summary_that_claims_more_than_there_can_be_does_not_matter(tmp_path):
+    path = make(tmp_path, 'mcap')
+    data = bytearray(path.read_bytes())
+    start = int.from_bytes(data[-28:-20], 'little')
+    data[start + 1:start + 9] = (2**62).to_bytes(8, 'little')
+    path.write_bytes(data)
+    assert len(left(path)[0]) == 2 * FRAMES
+
+
+def records_of(data):
+    """Opcode of each record of an mcap file, and where its content begins."""
+    place = 8
+    while place + 9 <= len(data) - 8:
+        length = int.from_bytes(data[place + 1:place + 9], 'little')
+        yield data[place], place + 9
+        place += 9 + length
+
+
 def test_rows_of_old_recordings_have_no_definitions(tmp_path):
     path = tmp_path / 'old.db3'
     database = sqlite3.connect(path)
