@@ -30,6 +30,8 @@ METADATA = 'metadata.yaml'
 TOLD = 3
 #: Frames in a slice, about: few enough to be kept in memory, enough to be worth opening the recording for.
 SLICE = 32
+#: Bytes on the disk that a frame takes at least, about: what a damaged recording says of their number may be anything.
+LEAST_FRAME = 128
 
 Reader = Reader1 | Reader2
 
@@ -291,7 +293,7 @@ def plan(
                 raise RecordingError(f'{path}: no images on {topic!r}, but on {", ".join(sorted(known)) or "no topic"}')
         chosen = tuple(dict.fromkeys(topics or sorted(known.keys() - _overlays(reader))))
         connections = [connection for connection in reader.connections if connection.topic in chosen]
-        count = sum(connection.msgcount for connection in connections)
+        count = min(sum(connection.msgcount for connection in connections), 1 + _size(path) // LEAST_FRAME)
         if not connections or not count:
             return []
         duration = reader.end_time - reader.start_time
@@ -304,6 +306,11 @@ def plan(
         edges = [begin + (stop - begin) * k // number for k in range(number + 1)]
         slices = [Slice(path, chosen, first, last, every) for first, last in pairwise(edges) if first < last]
         return _counted(reader, slices) if every > 1 else slices
+
+
+def _size(path: Path) -> int:
+    """Bytes of the files of a recording."""
+    return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 
 def _counted(reader: Reader, slices: list[Slice]) -> list[Slice]:

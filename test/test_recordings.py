@@ -667,3 +667,16 @@ def test_every_counts_from_the_start_that_was_asked_for(recording):
     slices = plan(recording, topics=[], start=0.2, every=4)
     assert slices[0].skipped == (0,)
     assert slices[-1].skipped == (len(contents(recording, None, slices[0].start, slices[-1].start)),)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_slices_are_no_more_than_there_is_room_for(tmp_path, storage):
+    """What metadata say of the number of messages may be anything."""
+    path = write(tmp_path / 'rec', film(40), storage)
+    honest = plan(path, topics=[])
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('message_count: 40', 'message_count: 100000000000'))
+    claimed = plan(path, topics=[])
+    assert len(honest) == 2
+    assert 2 <= len(claimed) < 100
+    assert (claimed[0].start, claimed[-1].stop) == (honest[0].start, honest[-1].stop)
