@@ -42,6 +42,7 @@ from line_feature_node.recordings import (
     OUTPUTS,
     SALVAGE,
     SALVAGED,
+    Buffer,
     RecordingError,
     Salvage,
     Slice,
@@ -533,13 +534,15 @@ class _Copier:
         """
         with told(self._path):
             for connection, stamp, data in self._reader.messages(self._sources, start, stop) if self._sources else ():
-                copied = self._converted(connection, data) if self._ros1 else data
+                copied = self._converted(connection, data)
                 if copied is not None:
                     yield stamp, self._targets[connection.id], copied
 
     def _converted(self, connection: Connection, data: bytes) -> bytes | None:
         try:
-            return as_ros2(self._types, data, connection.msgtype)
+            if not isinstance(data, Buffer):
+                raise ValueError(f'no {connection.msgtype}: {type(data).__name__} where bytes are expected')
+            return as_ros2(self._types, data, connection.msgtype) if self._ros1 else data
         except ValueError as error:
             self.spoilt[f'{connection.topic}: {error}'] += 1
             return None

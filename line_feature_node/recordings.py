@@ -34,6 +34,8 @@ SLICE = 32
 LEAST_FRAME = 128
 
 Reader = Reader1 | Reader2
+#: What messages are in; a damaged table of sqlite3 may have anything in its place.
+Buffer = bytes | bytearray | memoryview
 
 
 class RecordingError(ValueError):
@@ -248,6 +250,8 @@ def deserialize(path: Path, data: bytes, msgtype: str) -> Any:
     Raises:
         ValueError: They are none.
     """
+    if not isinstance(data, Buffer):
+        raise ValueError(f'no {msgtype}: {type(data).__name__} where bytes are expected')
     try:
         if is_ros1(path):
             return typestore(ros1=True).deserialize_ros1(memoryview(data), msgtype)

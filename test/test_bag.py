@@ -9,6 +9,7 @@ import os
 import resource
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -583,6 +584,20 @@ def test_definitions_of_a_lone_file_give_the_hashes_of_ros2(tmp_path):
     process(lone(path, tmp_path / 'lone.mcap'), tmp_path / 'out', copy=True)
     copied = topics(tmp_path / 'out')
     assert {topic: copied[topic].digest for topic in hashes} == hashes
+
+
+@pytest.mark.parametrize(('value', 'kind'), [("'text'", 'str'), ('4.0e300', 'float'), ('5', 'int')])
+def test_what_a_table_has_in_the_place_of_messages_is_counted(tmp_path, value, kind):
+    path = write(tmp_path / 'rec', [*film(3), ('/words', TEXT, stamp_of(2) + 1, text('good'))], 'sqlite3')
+    database = sqlite3.connect(next(path.glob('*.db3')))
+    with database:
+        database.execute(f'UPDATE messages SET data = {value} WHERE id IN (2, 4)')
+    database.close()
+    outcome = process(path, tmp_path / 'out', copy=True)
+    assert dict(outcome.failed) == {f'no {IMAGE}: {kind} where bytes are expected': 1}
+    assert dict(outcome.spoilt) == {f'/camera: no {IMAGE}: {kind} where bytes are expected': 1,
+                                    f'/words: no {TEXT}: {kind} where bytes are expected': 1}
+    assert len(outcome.frames.good) == 2
 
 
 def test_bad_messages_are_not_copied_but_counted_and_the_rest_goes_on(tmp_path):
