@@ -1,5 +1,5 @@
-# make install, demo, test, test-all, lint, colcon, bench, bench-node, bench-bag, soak-bag, audit: everything goes into
-# .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
+# make install, demo, test, test-all, fuzz, lint, colcon, bench, bench-node, bench-bag, soak-bag, audit: everything goes
+# into .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,6 +10,8 @@ SEED ?= 0
 YORK ?=
 # The ROS 2 packages of PyPI are for these machines only; others have ROS 2 from their distribution.
 EXTRA := $(if $(filter x86_64,$(shell uname -m)),ros)
+# Options of the fuzzing campaign: --inputs 100000 --seed 2 --doors image.
+FUZZ ?=
 # opencv-contrib, which has EdgeDrawing, cannot be where OpenCV is.
 PEERS := .venv-peers
 # What the package needs, without ROS 2, which comes from a distribution that says itself what is wrong with it.
@@ -24,7 +26,7 @@ AUDIT := .venv-audit
 #   D417            arguments that belong together are described together
 PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
 
-.PHONY: install demo test test-all lint colcon bench bench-node bench-bag soak-bag audit docs clean
+.PHONY: install demo test test-all fuzz lint colcon bench bench-node bench-bag soak-bag audit docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -36,6 +38,13 @@ test: $(VENV)/.test
 # The tests on every Python from 3.10 up that is found.
 test-all:
 	.ci/test-all
+
+# Inputs with something wrong through every door, a million unless FUZZ says otherwise, and then those of the extractor
+# through kernels that check every index; docs/reliability.md says what was found.
+fuzz: $(VENV)/.test
+	$(BIN)/python test/fuzz/campaign.py $(FUZZ)
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=build/fuzz-cache $(BIN)/python test/fuzz/campaign.py $(FUZZ) --doors extractor \
+		--results build/fuzz-bounds
 
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .
