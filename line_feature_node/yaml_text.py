@@ -4,6 +4,9 @@ from typing import Any
 
 import yaml
 
+#: Levels that a text without aliases may have, as each takes longer than the one before.
+DEEPEST = 100
+
 
 def parsed(text: str, *, aliases: bool = True) -> Any:
     """What a text in YAML says, in plain types.
@@ -31,5 +34,12 @@ def parsed(text: str, *, aliases: bool = True) -> Any:
 
 
 def _first_alias(text: str) -> str | None:
-    events = yaml.parse(text, yaml.SafeLoader)
-    return next((event.anchor for event in events if isinstance(event, yaml.AliasEvent)), None)
+    """The name of the first alias; RecursionError where it there are too many levels."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            return event.anchor
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise RecursionError
+    return None

@@ -27,7 +27,13 @@ def test_what_is_no_yaml_is_a_sentence(text):
     assert '\n' not in str(caught.value)
 
 
-@pytest.mark.parametrize('text', ['[' * 5000, '{a: ' * 5000])
-def test_what_is_nested_without_end_is_a_sentence(text):
+@pytest.mark.parametrize('aliases', [True, False])
+@pytest.mark.parametrize('text', ['[' * 50_000, '{a: ' * 50_000])
+def test_what_is_nested_without_end_is_a_sentence_soon(text, aliases):
+    """All levels of it would take hours."""
     with pytest.raises(ValueError, match='^nested too deep$'):
-        parsed(text)
+        parsed(text, aliases=aliases)
+
+
+def test_settings_are_not_too_deep():
+    assert parsed('{a: ' * 90 + '1' + '}' * 90, aliases=False)
