@@ -25,7 +25,7 @@ class Door:
         make: An input, by chance.
         check: Has the package take it, with a folder for files that is empty but for what it left there itself; returns
             the bytes of the image that there was, 0 where there was none, and -1 where it was refused.
-        share: How many of a million inputs are for this door.
+        share: How many inputs of a whole campaign are for this door.
         multiple: Memory that may be taken for each byte of the image.
         prepare: Called once before, as compiling takes time and memory.
     """
@@ -73,7 +73,7 @@ DOORS = {
     'image': Door(pictures.image_message, without_folder(pictures.check_image), 500_000, multiple=4),
     'compressed': Door(pictures.compressed_message, without_folder(pictures.check_compressed), 100_000, multiple=8),
     'segments': Door(pictures.segments_message, without_folder(pictures.check_segments), 340_000, multiple=4),
-    'extractor': Door(pictures.extractor_input, without_folder(pictures.check_extractor), 30_000, multiple=200,
+    'extractor': Door(pictures.extractor_input, without_folder(pictures.check_extractor), 100_000, multiple=200,
                       prepare=load_kernels),
     'parameters': Door(settings.parameter_file, settings.check_parameter_file, 6_000, prepare=mute),
     'arguments': Door(settings.arguments, settings.check_arguments, 1_000, prepare=mute),

@@ -191,14 +191,14 @@ def check_remains(fields: dict[str, Any], folder: Path) -> int:
     """What is left of a file: messages that are what they say, and words on what is not; never an error."""
     path = folder / 'file.rec'
     path.write_bytes(fields['data'])
-    size, damage = 0, []
+    messages, size, damage = 0, 0, []
     for message in remains(path, folder, damage):
         assert isinstance(message.data, bytes)
         assert isinstance(message.stamp, int)
         assert all(isinstance(value, str) for value in dataclasses.astuple(message.channel)[:4])
-        size += len(message.data)
+        messages, size = messages + 1, size + len(message.data)
     assert all('\n' not in words for words in damage)
-    if readable(path) and kind_of(path) != ZSTD and not size and not damage:
+    if readable(path) and kind_of(path) != ZSTD and not messages and not damage:
         raise AssertionError('nothing is left of what is readable')
     assert [entry.name for entry in folder.iterdir()] == ['file.rec']
     return size
