@@ -1,9 +1,11 @@
 """Refined segments lie where the edges are, tell how well that is known, and are there for edges alone."""
 
+import base64
 import math
 import os
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -569,3 +571,18 @@ def test_kernels_without_the_compiler_give_the_same(tmp_path: Any) -> None:
     assert len(found) == len(expected) > 0
     for name in set(SEGMENT_DTYPE.names or ()):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-3, atol=1e-3, err_msg=name)
+
+
+#: Lines, levels 0 to 4 of 41×36 pixels, that the fuzzing campaign drew.
+DRAWN = (
+    'c-qC3OA>$}3`0rV`=41<M1E~`V6+Qe_$DFKNC>}-yoTU2@P!a&m<+)`HT-BT!adWgbkN9%*=HIl?Yvwf+S;-otkv>uWJB;e68+#8'
+    '34Ym-^NFRB@`+_cWI+ju(EiXFI)?dt(>PN4ctJIGr8b~)*R>z%b;we7V^~V7&;D9WUN*Ao)><a?d^XFZ0f7'
+)
+LEVELS = np.array([0, 5.07e37, 1.768e38, 2.717e38, 3.172e38], np.float32)
+
+
+def test_gradients_that_are_no_numbers_end_no_process() -> None:
+    """The window in which an end is looked for was that of a NaN, made a whole number."""
+    drawn = np.frombuffer(zlib.decompress(base64.b85decode(DRAWN)), np.uint8).reshape(41, 36)
+    segments = extract(LEVELS[drawn], profile='welding_panel', thinning='none', operator='prewitt')
+    assert all(np.isfinite(end_points(segments)).ravel())

@@ -385,8 +385,11 @@ def extend(
         at_first, at_last: Whether its first and its last end are looked for.
         values: Memory for what supports the line in each step.
     """
-    response = max(line['response'], 1e-6)
-    half = int(min(WINDOW + WINDOW_NOISE * (noise / response)**2, LARGEST_WINDOW)) // 2
+    # Of a response that is no number, as pixels near the largest float have it, the window is the largest.
+    size = WINDOW + WINDOW_NOISE * (noise / max(line['response'], 1e-6))**2
+    if not size < LARGEST_WINDOW:
+        size = LARGEST_WINDOW
+    half = int(size) // 2
     first, last = line['first'], line['last']
     if at_last:
         line['last'] = end_of(line, 1, last, first, half, gradient, in_p, in_q, step_p, step_q, size_p, size_q,
