@@ -17,6 +17,7 @@ import pytest
 from test_pipeline import half_plane, scene
 
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, end_points, extract
+from line_feature_node.core.refinement import within
 
 Image = npt.NDArray[Any]
 Segments = npt.NDArray[np.void]
@@ -586,3 +587,30 @@ def test_gradients_that_are_no_numbers_end_no_process() -> None:
     drawn = np.frombuffer(zlib.decompress(base64.b85decode(DRAWN)), np.uint8).reshape(41, 36)
     segments = extract(LEVELS[drawn], profile='welding_panel', thinning='none', operator='prewitt')
     assert all(np.isfinite(end_points(segments)).ravel())
+
+
+# Where a line is in the picture
+
+NOT_FINITE = [math.nan, math.inf, -math.inf, 1e300]
+
+
+@pytest.mark.parametrize(('slope', 'intercept', 'first', 'last', 'expected'), [
+    (0.0, 10.0, 2.5, 7.5, (3, 7)), (0.0, 10.0, -50.0, 1e9, (0, 99)), (0.0, 49.5, 0.0, 9.0, (0, 9)),
+    (1.0, -20.0, 0.0, 99.0, (20, 69)), (-1.0, 20.0, 0.0, 99.0, (0, 20)), (0.1, 4.0, 10.0, 12.0, (10, 12))])
+def test_where_a_line_is_within_the_picture(
+    slope: float, intercept: float, first: float, last: float, expected: tuple[int, int],
+) -> None:
+    assert within(slope, intercept, first, last, 0.5, 100, 50) == expected
+
+
+@pytest.mark.parametrize(('slope', 'intercept', 'first', 'last'), [
+    (0.0, 60.0, 0.0, 9.0), (0.0, 10.0, 7.0, 6.0), (1e-300, 1e6, 0.0, 99.0), (1.0, 100.0, 0.0, 99.0),
+    (0.0, 10.0, 120.0, 130.0), (0.0, 10.0, -9.0, -1.0),
+    *((value, 0.0, 0.0, 5.0) for value in NOT_FINITE), *((0.0, value, 0.0, 5.0) for value in NOT_FINITE),
+    *((0.0, 0.0, value, 5.0) for value in NOT_FINITE), *((0.0, 0.0, 0.0, value) for value in NOT_FINITE)])
+def test_a_line_that_is_nowhere_in_the_picture(slope: float, intercept: float, first: float, last: float) -> None:
+    """No place is looked at, as it would lie outside the memory of the picture."""
+    low, high = within(slope, intercept, first, last, 0.5, 100, 50)
+    assert high < low
+    assert low >= 0
+    assert high >= -1

@@ -197,11 +197,12 @@ def within(
     Where it is nowhere, the last is less than the first; so it is for what is no number. By rounding the line may be
     a little farther out there.
     """
+    # Of a number and what is none, min and max give the one or the other.
+    if not (abs(slope) < FARTHEST and abs(intercept) < FARTHEST and abs(first) < FARTHEST and abs(last) < FARTHEST):
+        return 0, -1
     low, high = max(first, 0.0), min(last, size_p - 1.0)
     least, most = -beyond, size_q - 1 + beyond
-    if not (abs(slope) < FARTHEST and abs(intercept) < FARTHEST):
-        high = -1.0
-    elif slope != 0:
+    if slope != 0:
         at_least, at_most = (least - intercept) / slope, (most - intercept) / slope
         low, high = max(low, min(at_least, at_most)), min(high, max(at_least, at_most))
     elif not least <= intercept <= most:
