@@ -182,6 +182,13 @@ def across(gradient: Any, along_p: int, along_q: int, np_: Any, nq: Any) -> Any:
 
 
 @inlined
+def profile(gradient: Any, along_p: int, along_q: int, step_q: int, np_: Any, nq: Any) -> tuple[Any, Any, Any]:
+    """The gradient across a line at a pixel, and at those beside it, towards smaller and larger q."""
+    return (across(gradient, along_p - step_q, along_q - step_q, np_, nq), across(gradient, along_p, along_q, np_, nq),
+            across(gradient, along_p + step_q, along_q + step_q, np_, nq))
+
+
+@inlined
 def normal_of(slope: float, sign: float) -> tuple[Any, Any]:
     """The unit normal of a line that the gradient points along, its parts along p and q."""
     scale = sign / math.sqrt(1 + slope * slope)
@@ -261,9 +268,7 @@ def align(
         q = slope * p + intercept
         r = math.floor(q + HALF)
         index = p * step_p + r * step_q
-        before = across(gradient, in_p + index - step_q, in_q + index - step_q, np_, nq)
-        at = across(gradient, in_p + index, in_q + index, np_, nq)
-        behind = across(gradient, in_p + index + step_q, in_q + index + step_q, np_, nq)
+        before, at, behind = profile(gradient, in_p + index, in_q + index, step_q, np_, nq)
         t, d, first = np.float32(p - middle), np.float32(r - q), behind - before
         response += at
         curvature += behind + before - (at + at)
@@ -303,9 +308,7 @@ def align_to_peaks(
         q = slope * p + intercept
         r = math.floor(q + HALF)
         index = p * step_p + r * step_q
-        before = across(gradient, in_p + index - step_q, in_q + index - step_q, np_, nq)
-        at = across(gradient, in_p + index, in_q + index, np_, nq)
-        behind = across(gradient, in_p + index + step_q, in_q + index + step_q, np_, nq)
+        before, at, behind = profile(gradient, in_p + index, in_q + index, step_q, np_, nq)
         response += at
         first, second = behind - before, behind + before - (at + at)
         second += second
