@@ -3,6 +3,8 @@ import signal
 import subprocess
 import sys
 
+import cv2
+import numpy as np
 import pytest
 
 from line_feature_node import command
@@ -46,3 +48,16 @@ def test_the_command_has_interrupts_as_they_were(monkeypatch, capsys):
     assert end.value.code == 0
     assert capsys.readouterr().out.strip() == importlib.metadata.version('line_feature_node')
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_picture_of_any_format_has_bounds(tmp_path):
+    """A BMP of 1 kB that says it has more pixels than any that is decoded."""
+    data = bytearray(cv2.imencode('.bmp', np.zeros((4, 4), np.uint8))[1].tobytes())
+    data[18:26] = (30_000).to_bytes(4, 'little') * 2
+    (tmp_path / 'large.bmp').write_bytes(data)
+    program = 'from line_feature_node.command import main; main()'
+    done = subprocess.run([sys.executable, '-c', program, 'image', str(tmp_path / 'large.bmp')], check=False,
+                          capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert 'OpenCV cannot decode the image: pixels <= CV_IO_MAX_IMAGE_PIXELS' in done.stderr
+    assert len(done.stderr.splitlines()) == 1
