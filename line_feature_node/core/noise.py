@@ -16,7 +16,7 @@ from line_feature_node.core.parameters import Parameters
 #: The noise is measured in this many rows, or a few more, and in one of at least so many.
 ROWS, EVERY = 30, 16
 #: Bins of the histogram that the median is taken from, and how many there are to a grey level.
-BINS, RESOLUTION = 8192, 4
+BINS, RESOLUTION = 4096, 4
 #: The median of |x| of a normal distribution, in standard deviations.
 MEDIAN = 0.67449
 #: The second difference along x and y, [1 -2 1] by [1 -2 1], multiplies the noise by this.
