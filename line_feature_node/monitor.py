@@ -88,6 +88,34 @@ class Counts:
     failed: int = 0
 
 
+class Gaps:
+    """Tells by publication sequence numbers how many frames never came, of one publisher or of several.
+
+    Who published a frame is not known. Its number goes on with the nearest lower one of the latest of each publisher;
+    taking a publisher for another so makes no difference to the sum.
+    """
+
+    def __init__(self) -> None:
+        self._latest: list[int] = []  # of each publisher, in the order in which they came
+
+    def missed(self, number: int, publishers: int) -> int:
+        """How many frames are missing before this one.
+
+        Args:
+            number: Its sequence number.
+            publishers: How many there are. One that was killed is among them for 20 s, until its lease ends.
+        """
+        missed = 0
+        before = max((latest for latest in self._latest if 0 < number - latest <= LARGEST_JUMP), default=None)
+        # Beyond a gap it may be the first frame of a publisher of which none came yet.
+        if before is not None and (number == before + 1 or len(self._latest) >= publishers):
+            self._latest.remove(before)
+            missed = number - before - 1
+        self._latest.append(number)
+        del self._latest[:-max(publishers, 1)]
+        return missed
+
+
 @dataclass
 class Monitor:
     """Counts frames and measures times; told of each frame by the node.
@@ -104,7 +132,7 @@ class Monitor:
     clock: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
-        self._sequence: int | None = None
+        self._gaps = Gaps()
         self._recent: deque[tuple[float, float, tuple[float, ...]]] = deque(maxlen=WINDOW)  # when, latency, steps
         self._segments = 0
         self._reported = Counts()
@@ -112,22 +140,20 @@ class Monitor:
 
     def restart(self) -> None:
         """Images are waited for from now on, by a new subscription: its sequence numbers begin anywhere."""
-        self._sequence = None
+        self._gaps = Gaps()
         self._last_image = self.clock()
 
-    def receive(self, sequence: int | None) -> None:
+    def receive(self, sequence: int | None, publishers: int = 1) -> None:
         """Count a frame and, by its publisher's sequence number, those before it that never came.
 
         Args:
-            sequence: Publication sequence number; None where it says nothing, as with several publishers.
+            sequence: Publication sequence number; None where the middleware does not tell.
+            publishers: How many there are.
         """
         self.counts.received += 1
         self._last_image = self.clock()
-        if sequence is not None and self._sequence is not None:
-            missed = sequence - self._sequence - 1
-            if 0 < missed < LARGEST_JUMP:
-                self.counts.dropped += missed
-        self._sequence = sequence
+        if sequence is not None:
+            self.counts.dropped += self._gaps.missed(sequence, publishers)
 
     def process(self, latency: float, times: Mapping[str, float], segments: int) -> None:
         """Count a frame that gave segments.

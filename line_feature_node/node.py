@@ -344,8 +344,8 @@ class LineFeatureNode(LifecycleNode):
         """Process one frame. Whatever is wrong with it costs a line in the log, and the next one is processed."""
         begin = time.time_ns()
         subscription = self._subscription
-        alone = subscription is not None and subscription.get_publisher_count() == 1
-        self._monitor.receive(info.get('publication_sequence_number') if alone else None)
+        publishers = 1 if subscription is None else subscription.get_publisher_count()
+        self._monitor.receive(info.get('publication_sequence_number'), publishers)
         try:
             image = decode(message)
             segments = self._extractor.extract(image, usable_pixels(image, self._mask))

@@ -1,4 +1,6 @@
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from line_feature_node.core import STEPS
 from line_feature_node.monitor import LARGEST_JUMP, WINDOW, Level, Monitor, Publishers, Throttle
@@ -83,10 +85,61 @@ def test_absurd_jump_is_no_loss(monitor):
     assert monitor.counts.dropped == LARGEST_JUMP - 1
 
 
-def test_unknown_number_ends_the_counting_until_there_are_two_known_ones(monitor):
-    frames(monitor, [1, None, 50, 52])
+def test_unknown_numbers_drop_nothing(monitor):
+    frames(monitor, [None, None, 50, None, 51])
+    assert monitor.counts.dropped == 0
+    assert monitor.counts.received == 5
+
+
+@pytest.mark.parametrize(('numbers', 'publishers', 'dropped'), [
+    ([500, 501, 1, 2, 5, 6, 9], 2, 4),  # the first was killed, and is known of until its lease ends
+    ([3, 4, 1, 2, 3, 4, 5, 6, 7], 2, 0), ([3, 4, 1, 2, 3, 4, 5, 8], 2, 2),  # the second overtakes what the first sent
+    ([100, 5000, 101, 5001, 5002, 102], 2, 0), ([100, 5000, 103, 5001, 5004, 104], 2, 4),
+    ([7, 7, 8, 8, 9, 9, 10, 11], 2, 0), ([7, 7, 8, 8, 9, 10, 10, 12, 12], 2, 3),
+    ([1, 30, 60, 2, 31, 61, 5, 32, 62], 3, 2),
+])
+def test_gaps_of_several_publishers_are_dropped_frames(monitor, numbers, publishers, dropped):
+    """Whose number is whose does not matter to the sum, not even where they are the same."""
+    for number in numbers:
+        monitor.receive(number, publishers)
+    assert monitor.counts.dropped == dropped
+
+
+def test_gap_that_may_be_another_publisher_is_no_loss(monitor):
+    for number in (10, 11, 400):
+        monitor.receive(number, 2)
+    assert monitor.counts.dropped == 0
+
+
+def test_publisher_that_is_gone_is_forgotten(monitor):
+    """What comes later is not held against where it was."""
+    for number, publishers in ((100, 2), (7, 2), (8, 1), (9, 1), (102, 2)):
+        monitor.receive(number, publishers)
+    assert monitor.counts.dropped == 0
+    monitor.receive(104, 2)
     assert monitor.counts.dropped == 1
-    assert monitor.counts.received == 4
+
+
+@settings(max_examples=300)
+@given(
+    starts=st.lists(st.integers(1, 40), min_size=1, max_size=4), whose=st.lists(st.integers(0, 3), max_size=60),
+    lost=st.sets(st.integers(0, 59)))
+def test_never_more_is_dropped_than_was_sent_and_did_not_come(starts, whose, lost):
+    """Nearby numbers of several publishers, mixed in any order, of which any may be lost."""
+    monitor, latest = Monitor(), list(starts)
+    for number in starts:
+        monitor.receive(number, len(starts))
+    missing = 0
+    for k, publisher in enumerate(whose):
+        publisher %= len(starts)
+        latest[publisher] += 1
+        if k in lost:
+            missing += 1
+        else:
+            monitor.receive(latest[publisher], len(starts))
+    assert monitor.counts.dropped <= missing
+    if not missing:
+        assert monitor.counts.dropped == 0
 
 
 def test_new_subscription_begins_anew(monitor):
