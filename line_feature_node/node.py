@@ -61,6 +61,8 @@ THROTTLE = 5.0
 OUTPUT_DEPTH = 5
 #: Of glibc's malloc.h: the largest block that comes from the heap, and how much of its end may lie unused.
 MALLOC_OPTIONS = ((-3, 'MMAP', 32 << 20), (-1, 'TRIM', 256 << 20))
+#: How rcl begins to say that it cannot make the folder of the log files.
+NO_LOGGING = 'failed to initialize logging: '
 #: Frames after which a 16-bit stream is looked at again, whether it uses its range.
 HINT_EVERY = 100
 
@@ -509,9 +511,23 @@ def _keep_memory() -> None:
                 mallopt(number, size)
 
 
-def _started(args: list[str]) -> LineFeatureNode:
+def _init(args: list[str]) -> None:
+    """Begin with ROS 2; where its folder of logs cannot be made, without files of logs, which would end us here."""
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RCLError as error:
+        if not str(error).startswith(NO_LOGGING):
+            raise
+        rclpy.try_shutdown()  # of what is half begun
+        rclpy.init(args=[*args, '--ros-args', '--disable-external-lib-logs'],
+                   signal_handler_options=SignalHandlerOptions.NO)
+        reason = str(error).removeprefix(NO_LOGGING).split(', at ', 1)[0]
+        get_logger('line_feature_node').warning(f'there is no file of the log, set ROS_LOG_DIR to have one: {reason}')
+
+
+def _started(args: list[str]) -> LineFeatureNode:
+    try:
+        _init(args)
     except UnknownROSArgsError as error:
         raise ConfigurationError(f'unknown arguments behind --ros-args: {error}') from None
     unknown = remove_ros_args(args)[1:]

@@ -19,7 +19,9 @@ if 'COLCON' in os.environ:
     sys.path[:] = [entry for entry in sys.path if Path(entry).resolve() != ROOT]
 
 #: They need ROS 2.
-ROS_TESTS = ['test_demo.py', 'test_node.py', 'test_node_parameters.py', 'test_node_process.py']
+ROS_TESTS = [
+    'test_demo.py', 'test_faults.py', 'test_node.py', 'test_node_parameters.py', 'test_node_process.py', 'test_soak.py',
+]
 collect_ignore = [] if find_spec('rclpy') else ROS_TESTS
 
 
@@ -57,6 +59,26 @@ def bench(capfd):
     bench = Bench(capfd)
     yield bench
     bench.close()
+
+
+@pytest.fixture
+def start(bench, tmp_path):
+    """Starts a node as a process and waits until it says that it is ready."""
+    from test_node_process import START, Process
+
+    processes = []
+
+    def start(*arguments, word='ready; waits', **options):
+        process = Process(tmp_path, *arguments, **options)
+        processes.append(process)
+        bench.until(lambda: word in process.log or process.process.poll() is not None, f'{word!r}', START)
+        assert word in process.log, process.log
+        return process
+
+    yield start
+    for process in processes:
+        process.process.kill()
+        process.process.wait()
 
 
 @pytest.fixture

@@ -16,17 +16,20 @@ from test_node import DEADLINE, expected, image, picture
 from line_feature_node.messages import segments_of
 
 #: Seconds until a process has its kernels, which may have to be compiled, and until it ends.
-START = 60.0
+START = 150.0
 
 
 class Process:
-    """A node that runs beside the test; what it says goes into a file."""
+    """A node that runs beside the test; what it says goes into a file.
 
-    def __init__(self, folder, *arguments, **environment):
-        self.path = folder / 'log'
+    It is run by a command, if there is one, which stands before it.
+    """
+
+    def __init__(self, folder, *arguments, command=(), **environment):
+        self.path = folder / f'log{len(list(folder.glob("log*")))}'
         with self.path.open('wb') as log:
             self.process = subprocess.Popen(
-                [sys.executable, '-m', 'line_feature_node', *arguments], stdout=log, stderr=log, cwd=folder,
+                [*command, sys.executable, '-m', 'line_feature_node', *arguments], stdout=log, stderr=log, cwd=folder,
                 env={**os.environ, 'ROS_LOG_DIR': str(folder / 'ros'), **environment})
 
     @property
@@ -36,24 +39,6 @@ class Process:
     def end(self, number=signal.SIGTERM):
         self.process.send_signal(number)
         return self.process.wait(DEADLINE)
-
-
-@pytest.fixture
-def start(bench, tmp_path):
-    """Starts a node and waits until it says that it is ready."""
-    processes = []
-
-    def start(*arguments, word='ready; waits'):
-        process = Process(tmp_path, *arguments)
-        processes.append(process)
-        bench.until(lambda: word in process.log or process.process.poll() is not None, f'{word!r}', START)
-        assert word in process.log, process.log
-        return process
-
-    yield start
-    for process in processes:
-        process.process.kill()
-        process.process.wait()
 
 
 def refused(folder, *arguments):
