@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, extract_blobs
+from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, colour, extract_blobs
 from line_feature_node.core.buffers import Buffers
 
 Pixels = NDArray[np.int64]
@@ -179,6 +179,16 @@ def test_labels_that_merged_are_empty() -> None:
     assert used.size > 1
     assert blobs.attributes['size'][used].tolist() == [11]
     assert not blobs.attributes['size'][~used].any()
+
+
+def test_more_labels_than_a_byte_can_count_without_the_compiler() -> None:
+    """Codes are bytes, and Python computes in them where they are not turned into larger numbers."""
+    pixels = 10 + 2 * np.arange(90, dtype=np.int32)
+    codes = np.full(90, 4, np.uint8)
+    colours, labels, parents = (np.zeros(400, np.int32) for _ in range(3))
+    plain = getattr(colour, 'py_func', colour)
+    assert plain(pixels, codes, 200, colours, labels, parents) == 90
+    assert labels[:90].tolist() == parents[:90].tolist() == list(range(90))
 
 
 def test_no_pixels() -> None:

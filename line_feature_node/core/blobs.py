@@ -89,7 +89,7 @@ def colour(pixels: Any, codes: Any, stride: int, colours: Any, labels: Any, pare
             used += 1
         labels[k] = used - 1
         # A colour is 8 (label + 1) + code; 0 is background.
-        colours[pixels[k]] = used << 3 | codes[k]
+        colours[pixels[k]] = used << 3 | np.int64(codes[k])
     # Unsigned indices spare the test whether to count from the end.
     one, row = np.uint64(1), np.uint64(stride)
     for k in range(pixels.size):
