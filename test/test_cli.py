@@ -143,6 +143,54 @@ def test_compare_of_a_bad_file_is_one_sentence(run, tmp_path):
     assert result.stderr == f'{tmp_path}/missing.png: No such file or directory\n'
 
 
+def test_compare_of_a_file_that_is_no_image_is_one_sentence(run, tmp_path):
+    (tmp_path / 'text.png').write_text('no picture')
+    result = run('compare', tmp_path / 'text.png', '--out', tmp_path / 'out')
+    assert result.exit_code == 2
+    assert result.stderr == f'{tmp_path}/text.png: not an image that OpenCV can decode\n'
+
+
+def test_compare_says_where_it_cannot_write(run, photo):
+    result = run('compare', photo, '--out', photo / 'out')
+    assert result.exit_code == 2
+    assert result.stderr == f'cannot write to {photo}/out: Not a directory\n'
+
+
+def test_compare_without_an_image_measures_each_combination(run, tmp_path):
+    result = run('compare', '--out', tmp_path / 'out')
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / 'out' / 'corridor-section3.png').exists()
+    rows = [[cell.strip() for cell in line.split('│')[1:-1]] for line in result.output.splitlines() if '│' in line]
+    assert {row[0] for row in rows} == set(Parameters.specs()['thinning'].choices)
+    assert {row[1] for row in rows} == set(Parameters.specs()['orientation'].choices)
+    for *_, precision, recall, angle, offset in rows:
+        assert 0 < float(precision) <= 1
+        assert 0 < float(recall) <= 1
+        assert angle.endswith(' deg')
+        assert offset.endswith(' px')
+
+
+def test_the_demo_without_ros_says_where_it_cannot_write(run, photo, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'line_feature_node.demo', None)
+    result = run('demo', '--out', photo / 'out')
+    assert result.exit_code == 2
+    assert result.stderr.splitlines()[1:] == [f'cannot write to {photo}/out: Not a directory']
+
+
+def test_the_demo_without_ros_says_where_nothing_of_the_truth_was_found(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'line_feature_node.demo', None)
+    result = run('demo', '--out', tmp_path, '--T1', 900, '--T2', 899)
+    assert result.exit_code == 0, result.output
+    assert 'against the ground truth: nothing of it was found' in result.output
+
+
+def test_the_demo_without_ros_ends_where_its_picture_cannot_be_read(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'line_feature_node.demo', None)
+    result = run('demo', '--out', tmp_path, '--intensity_min', 300)
+    assert result.exit_code == 2
+    assert 'intensity_min must be less than intensity_max' in result.stderr
+
+
 def test_the_demo_without_ros_makes_do_with_a_picture(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, 'line_feature_node.demo', None)
     result = run('demo', '--out', tmp_path, '--profile', 'paper')
