@@ -1,5 +1,5 @@
-# make install, demo, test, test-all, fuzz, lint, colcon, bench, bench-node, bench-bag, soak-bag, audit: everything goes
-# into .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
+# make install, demo, test, test-all, coverage, faults, fuzz, lint, colcon, bench, bench-node, bench-bag, soak-bag, audit:
+# everything goes into .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -26,7 +26,11 @@ AUDIT := .venv-audit
 #   D417            arguments that belong together are described together
 PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
 
-.PHONY: install demo test test-all fuzz lint colcon bench bench-node bench-bag soak-bag audit docs clean
+# Tests of the modules that have kernels.
+KERNEL_TESTS = $(patsubst line_feature_node/core/%.py,test/test_%.py,$(shell \
+	grep -lE '^@(kernel|inlined)$$' line_feature_node/core/*.py))
+
+.PHONY: install demo test test-all coverage faults fuzz lint colcon bench bench-node bench-bag soak-bag audit docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -34,6 +38,21 @@ demo: install
 
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n auto
+
+# The tests under coverage, and its table. What the compiler makes of the kernels cannot be seen, so their tests run once
+# more as plain Python, but for those that take too long, or round otherwise.
+coverage: $(VENV)/.test
+	rm -rf build/coverage
+	mkdir -p build/coverage
+	$(BIN)/python -m coverage run -m pytest -n auto
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -m pytest -n auto -m 'not compiled' -W ignore::RuntimeWarning \
+		$(KERNEL_TESTS)
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage report
+
+# Deliberate faults in the core, and the test that finds each: hours. The table is in docs/reliability.md.
+faults: $(VENV)/.test
+	$(BIN)/python bench/faults.py
 
 # The tests on every Python from 3.10 up that is found.
 test-all:
@@ -85,7 +104,7 @@ docs: install
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf $(VENV) $(PEERS) $(AUDIT) .venv-3.* build/colcon
+	rm -rf $(VENV) $(PEERS) $(AUDIT) .venv-3.* build/colcon build/coverage
 
 # Where Debian's python3-venv is missing, a folder without pip is left behind: it must not pass for an environment.
 $(BIN)/python:

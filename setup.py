@@ -43,7 +43,8 @@ setup(
         'ros': ['ros-jazzy-common-interfaces>=5.3', 'ros-jazzy-rclpy[fastrtps]>=7.1'],
         'colcon': ['colcon-output>=0.2', 'colcon-ros>=0.5', 'colcon-test-result>=0.3.8'],
         'test': [
-            FLEET, 'catkin_pkg>=1.0', 'hypothesis>=6.100', 'mcap-ros2-support>=0.5', 'pytest>=8', 'pytest-xdist>=3.5',
+            FLEET, 'catkin_pkg>=1.0', 'coverage>=7.10', 'hypothesis>=6.100', 'mcap-ros2-support>=0.5', 'pytest>=8',
+            'pytest-xdist>=3.5',
         ],
         'fleet': [FLEET],
         # What ament's linters call is not required by their wheels: the plugins are those their package.xml names.

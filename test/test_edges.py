@@ -251,6 +251,13 @@ def test_suppression_and_thresholds(operator: dict[str, Any], shape: tuple[int, 
         assert clear.mean() > 0.8
 
 
+@pytest.mark.parametrize(('T1', 'T2', 'mark'), [(8.0, 2.0, 1), (7.9, 2.0, 1 | STRONG), (9.0, 8.0, 0), (9.0, 7.9, 1)])
+def test_a_gradient_of_just_a_threshold_does_not_exceed_it(T1: float, T2: float, mark: int) -> None:
+    """That of Sobel's operator is exactly 8 at a step of 16 grey levels."""
+    marks = marks_of(step(16, 8, 100, 116, axis=1), operator='sobel', T1=T1, T2=T2)
+    assert marks.max() == mark
+
+
 @pytest.mark.parametrize('operator', USUAL, ids=named)
 def test_direction_codes(operator: dict[str, Any]) -> None:
     """Four sections of 45 degrees of the gradient's angle modulo pi, centred on 0, 45, 90 and 135 degrees."""
@@ -279,6 +286,7 @@ def test_section_borders(angle: float, code: int, turn: int) -> None:
     assert set(codes[codes != 0]) == {code}
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('axis', [0, 1], ids=['rows', 'columns'])
 @pytest.mark.parametrize(('low', 'high'), [(0, 255), (100, 140), (215, 255), (0, 40), (240, 250)])
 @pytest.mark.parametrize('operator', USUAL, ids=named)
@@ -294,6 +302,7 @@ def test_step_leaves_the_pixel_before_it(operator: dict[str, Any], low: float, h
             assert set(codes[expected]) == {1 if axis == 1 else 3}
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(('alpha', 'low', 'high'), [(0.2, 215, 255), (0.3, 250, 240), (0.5, 250, 240)])
 def test_step_in_a_bright_image_with_much_smoothing(alpha: float, low: float, high: float) -> None:
     """As above where the gradient is small beside the grey levels, and rounding large beside the gradient."""
@@ -312,6 +321,7 @@ def test_blurred_step_leaves_one_pixel(operator: dict[str, Any]) -> None:
         assert set(found) <= ({1} if width <= 6 / operator.get('alpha', 1) else {0, 1}), width
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('operator', OPERATORS, ids=named)
 @pytest.mark.parametrize('value', [0, 1, 137, 255])
 def test_constant_image_has_no_edge(operator: dict[str, Any], value: int) -> None:
@@ -330,6 +340,7 @@ def test_constant_image_of_other_types(dtype: type, value: float) -> None:
         assert not marks_of(np.full(shape, value, dtype), T1=0.4, T2=0.2).any()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('operator', USUAL, ids=named)
 def test_no_edge_is_invented_by_the_size(operator: dict[str, Any]) -> None:
     """An image that varies along one axis only is the same edges in each row, or column, of any length."""
@@ -387,6 +398,7 @@ def test_part_of_the_range_stretches_uint8() -> None:
     np.testing.assert_array_equal(marks_of(image, intensity_max=255 / 4), marks_of(stretched))
 
 
+@pytest.mark.compiled
 def test_buffers_keep_nothing_of_the_frame_before() -> None:
     buffers = Buffers()
     for seed, (height, width) in enumerate([(40, 50), (40, 50), (33, 50), (40, 51), (1, 1), (40, 50)]):

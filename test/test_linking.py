@@ -374,7 +374,10 @@ def test_nearer_pair_is_linked_first(nearer: int, order: tuple[int, ...]) -> Non
 
 @pytest.mark.parametrize('beside', [9, 11])
 def test_ties_do_not_depend_on_the_order(beside: int) -> None:
-    """The middle one is as near to the left as to the right one, and linked with one it leaves the other's line."""
+    """The middle one is as near to the left as to the right one, and linked with one it leaves the other's line.
+
+    It is linked with the left one, whose coordinates come first.
+    """
     pieces = [piece(10, beside, 20, beside), piece(23, 10, 33, 10), piece(36, beside, 46, beside)]
     left, middle, right = lines_of(pieces)[0][:3]
     assert nearest_ends(left, middle)[0] == nearest_ends(middle, right)[0]
@@ -384,6 +387,7 @@ def test_ties_do_not_depend_on_the_order(beside: int) -> None:
                for order in itertools.permutations(range(3))]
     assert len(results[0]) == 2
     assert all(result == results[0] for result in results)
+    assert link(pieces, tau1=1.2, tau2=6.0)['x'].max() == 41
 
 
 @pytest.mark.parametrize('transposed', [False, True])
@@ -448,6 +452,7 @@ def test_more_pairs_than_lines() -> None:
     assert comparable(left) == reference(pieces, [3] * len(pieces), 20.0, 100.0)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(('tau1', 'tau2'), SETTINGS)
 @pytest.mark.parametrize('seed', range(5))
 def test_order_of_the_lines_does_not_matter(tau1: float, tau2: float, seed: int) -> None:
@@ -466,6 +471,7 @@ def test_order_of_the_lines_does_not_matter(tau1: float, tau2: float, seed: int)
     assert all(result == results[0] for result in results)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(('tau1', 'tau2'), SETTINGS)
 def test_nothing_is_left_to_link_and_no_pixel_is_lost(tau1: float, tau2: float) -> None:
     pieces, codes = broken_lines(np.random.default_rng(77), 250, 350)
@@ -488,6 +494,7 @@ def test_memory_of_the_last_frame_does_not_matter() -> None:
         assert comparable(lines[:alive.size][alive]) == comparable(link(pieces, codes))
 
 
+@pytest.mark.compiled
 def test_many_scattered_lines() -> None:
     """20,000 dashes in rows: gaps of 13 pixels between them, which one threshold bridges and the other does not."""
     columns, rows, size = 200, 100, 8

@@ -184,6 +184,7 @@ def test_clutter_raises_the_thresholds() -> None:
 
 # What the operators make of it
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('chosen', OPERATORS, ids=named)
 def test_noise_of_the_gradient(chosen: dict[str, Any]) -> None:
     parameters = Parameters(**chosen)
@@ -202,6 +203,7 @@ def test_gradient_of_a_step(chosen: dict[str, Any]) -> None:
     assert abs(gy[:, 60]).max() == pytest.approx(20 * step_response(parameters), rel=2e-3)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('chosen', OPERATORS, ids=named)
 def test_noise_is_correlated_along_an_edge(chosen: dict[str, Any]) -> None:
     """The mean of n gradients along an edge varies as that of n / length independent ones."""
@@ -269,6 +271,7 @@ def test_equal_noise_makes_equal_parameters() -> None:
     assert adapted(Parameters(), Quality(5)) != adapted(Parameters(), Quality(5 + 2 * STEP))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('operator', ['deriche', 'sobel'])
 def test_noise_has_few_edges(operator: str) -> None:
     """Less than one in fifty pixels, however strong it is."""
@@ -290,6 +293,17 @@ def test_masked_pixels_do_not_tell_what_the_noise_is(share: float) -> None:
     assert len(expected.segments) == 0
     assert (found.segments['y'] < first).all()
     assert (found.edges[inner] != 0).mean() < 2 * (expected.edges[inner] != 0).mean() + 0.002
+
+
+@pytest.mark.parametrize('left_out', [None, (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_pixel_counts_where_the_four_beside_it_do(left_out: tuple[int, int] | None) -> None:
+    image = np.random.default_rng(1).integers(0, 255, (20, 30), np.uint8)
+    keep = np.zeros(image.shape, np.uint8)
+    keep[9, 11:14] = keep[8:11, 12] = 255  # in one of the rows that are looked at
+    if left_out:
+        keep[9 + left_out[0], 12 + left_out[1]] = 0
+    quality = measure(image, Parameters(), Buffers(), keep)
+    assert (quality == Quality(ROUNDING)) == bool(left_out)
 
 
 def test_clutter_raises_the_thresholds_by_so_much_at_most() -> None:

@@ -105,6 +105,7 @@ def errors_of_edges(sigma: float, count: int = 250, size: int = 120) -> npt.NDAr
     return np.array(rows, np.float64)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(('sigma', 'offset', 'degrees'), [
     (0, 0.01, 0.01), (2, 0.01, 0.02), (5, 0.02, 0.03), (10, 0.035, 0.05), (20, 0.06, 0.1)])
 def test_edge_is_where_it_is(sigma: float, offset: float, degrees: float) -> None:
@@ -117,17 +118,20 @@ def test_edge_is_where_it_is(sigma: float, offset: float, degrees: float) -> Non
         assert abs(shift.mean()) < 0.003 + 3 * shift.std() / math.sqrt(len(shift))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('sigma', [0, 2, 5, 10])
 def test_one_edge_is_one_segment(sigma: float) -> None:
     """None is found twice, or in parts."""
     assert (errors_of_edges(sigma)[:, 7] == 1).all()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('sigma', [0, 5, 10, 20])
 def test_polarity_is_the_bright_side(sigma: float) -> None:
     assert errors_of_edges(sigma)[:, 8].all()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('sigma', [0, 5, 10, 20])
 def test_contrast_is_that_of_the_step(sigma: float) -> None:
     """A step between pixels at an angle is a little less smooth than one along an axis; none is far off."""
@@ -136,6 +140,7 @@ def test_contrast_is_that_of_the_step(sigma: float) -> None:
     assert contrast.std() < 0.06
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('sigma', [1, 2, 3, 5, 10, 20])
 def test_standard_deviations_are_honest(sigma: float) -> None:
     """Errors in units of them have a standard deviation of about one."""
@@ -146,6 +151,7 @@ def test_standard_deviations_are_honest(sigma: float) -> None:
         assert np.mean(abs(normalised) < 2) > 0.9
 
 
+@pytest.mark.compiled
 def test_standard_deviations_of_shorter_edges_are_honest() -> None:
     """Also of what is between the corners of a rectangle, and over all lengths and noises."""
     rng = np.random.default_rng(5)
@@ -177,6 +183,7 @@ def test_no_edge_is_known_for_certain(degrees: float) -> None:
     assert 1e-6 < segment['sigma_theta'] < 1e-2
 
 
+@pytest.mark.compiled
 def test_longer_and_clearer_edges_are_known_better() -> None:
     def known(step: float, size: int) -> tuple[float, float, float]:
         found = [extract(picture(60 + step * half_plane(size, size, 25, size / 2, size / 2), 5, seed))[0]
@@ -191,6 +198,7 @@ def test_longer_and_clearer_edges_are_known_better() -> None:
 
 # Ends
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(('sigma', 'usual', 'worst'), [(0, 0.8, 1.25), (5, 0.8, 1.35), (10, 0.95, 1.75)])
 def test_rectangle_has_four_sides_with_their_ends(sigma: float, usual: float, worst: float) -> None:
     """A smoothed corner is round: up to about a pixel is missing of each side."""
@@ -298,6 +306,7 @@ def test_stairs_of_one_polarity_are_told_apart() -> None:
             assert offsets == pytest.approx([-apart, 0, apart], abs=0.3)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('sigma', [0, 5, 15])
 def test_no_segment_runs_along_another(seed: int, sigma: float) -> None:
@@ -317,6 +326,7 @@ def test_no_segment_runs_along_another(seed: int, sigma: float) -> None:
 
 # What is no line
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('sigma', [2, 3, 5, 10, 20, 30, 45, 60])
 @pytest.mark.parametrize('level', [128, 20])
 def test_noise_has_no_segments(level: float, sigma: float) -> None:
@@ -412,6 +422,7 @@ def test_negative_of_a_picture_has_the_opposite_polarities() -> None:
         np.testing.assert_allclose(found[name], expected[name], rtol=5e-3, atol=2e-2, err_msg=name)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('seed', range(3))
 def test_more_alarms_and_less_clearness_let_more_through(seed: int) -> None:
     """What is accepted meets what was asked for."""
@@ -426,6 +437,7 @@ def test_more_alarms_and_less_clearness_let_more_through(seed: int) -> None:
 
 # Masks
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('degrees', [0, 20, 45, 90, 130])
 @pytest.mark.parametrize('sigma', [0, 8])
 def test_no_segment_goes_far_into_what_is_masked(degrees: float, sigma: float) -> None:
@@ -519,6 +531,7 @@ def test_layout_in_memory_does_not_matter(layout: Any, dtype: Any) -> None:
     assert same(extract(layout(image)), expected)
 
 
+@pytest.mark.compiled
 def test_same_picture_has_the_same_segments_whatever_was_before() -> None:
     extractor = LineFeatureExtractor()
     pictures = [scene(*shape, seed=seed, sigma=sigma) for seed, (shape, sigma) in enumerate([
@@ -529,6 +542,7 @@ def test_same_picture_has_the_same_segments_whatever_was_before() -> None:
         assert same(extractor.extract(pictures[k]), expected[k])
 
 
+@pytest.mark.compiled
 def test_every_subset_of_the_new_steps_works_by_itself() -> None:
     """Refinement of blobs of codes; straight stretches that are linked; neither."""
     image = picture(60 + 120 * bar(20, 80, 50), 3)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.scanning import Chains
-from line_feature_node.core.splitting import deviation_variance, split_chains
+from line_feature_node.core.splitting import LONGEST, UNIT, deviation_variance, split_chains
 
 Pixel = tuple[int, int]
 
@@ -138,6 +138,7 @@ def test_long_line_is_found_in_parts(length: int, degrees: float) -> None:
     found = split([line(length, degrees, 1500.0 if turned else 100.0, 100.0)])
     assert sum(stretch.size for stretch in found) > length - 2 * SLACK
     assert len(found) <= length / WHOLE + 1
+    assert max(stretch.size for stretch in found) == UNIT * LONGEST
     assert all(abs(distances(stretch.pixels)).max() < 1 for stretch in found)
 
 
