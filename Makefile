@@ -1,5 +1,5 @@
-# make install, demo, test, test-all, coverage, faults, fuzz, lint, colcon, bench, bench-node, bench-bag, soak-bag, audit:
-# everything goes into .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
+# make install, demo, test, test-all, coverage, faults, fuzz, lint, colcon, bench, bench-node, bench-bag, soak, soak-bag,
+# audit: everything goes into .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -30,7 +30,7 @@ PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
 KERNEL_TESTS = $(patsubst line_feature_node/core/%.py,test/test_%.py,$(shell \
 	grep -lE '^@(kernel|inlined)$$' line_feature_node/core/*.py))
 
-.PHONY: install demo test test-all coverage faults fuzz lint colcon bench bench-node bench-bag soak-bag audit docs clean
+.PHONY: install demo test test-all coverage faults fuzz lint colcon bench bench-node bench-bag soak soak-bag audit docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -88,6 +88,11 @@ bench-node: $(PEERS)/.installed
 # Frames a second of the offline run over recordings beside the bare extractor, and its memory.
 bench-bag: install
 	$(BIN)/python bench/bag.py --results bench/results
+
+# The node for half an hour among others that come, go and break, and twenty nodes on one machine; docs/reliability.md.
+soak: $(PEERS)/.installed $(VENV)/.test
+	LINE_FEATURE_TEST_NODES=20 $(BIN)/python -m pytest test/test_faults.py
+	$(PEERS)/bin/python bench/soak.py --results bench/results
 
 # Runs over recordings that are killed or lack something, and resumed: half an hour. Figures are in docs/reliability.md.
 soak-bag: install
