@@ -1,5 +1,5 @@
-# make install, demo, test, test-all, coverage, faults, fuzz, lint, colcon, bench, bench-node, bench-bag, soak, soak-bag,
-# audit: everything goes into .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
+# make install, demo, test, test-all, coverage, deliberate-faults, fuzz, lint, colcon, bench, bench-node, bench-bag, soak,
+# soak-bag, audit: everything goes into .venv, or .venv-3.10 and so on for test-all; nothing asks anything.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -30,7 +30,8 @@ PEP257_IGNORE := D105 D107 D203 D213 D401 D406 D407 D413 D417
 KERNEL_TESTS = $(patsubst line_feature_node/core/%.py,test/test_%.py,$(shell \
 	grep -lE '^@(kernel|inlined)$$' line_feature_node/core/*.py))
 
-.PHONY: install demo test test-all coverage faults fuzz lint colcon bench bench-node bench-bag soak soak-bag audit docs clean
+.PHONY: install demo test test-all coverage deliberate-faults fuzz lint colcon bench bench-node bench-bag soak soak-bag
+.PHONY: audit docs clean
 
 install: $(VENV)/.installed
 demo: install
@@ -51,8 +52,8 @@ coverage: $(VENV)/.test
 	$(BIN)/python -m coverage report
 
 # Deliberate faults in the core, and the test that finds each: hours. The table is in docs/reliability.md.
-faults: $(VENV)/.test
-	$(BIN)/python bench/faults.py
+deliberate-faults: $(VENV)/.test
+	$(BIN)/python bench/deliberate_faults.py
 
 # The tests on every Python from 3.10 up that is found.
 test-all:

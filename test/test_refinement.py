@@ -17,7 +17,7 @@ import pytest
 from test_pipeline import half_plane, scene
 
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, end_points, extract
-from line_feature_node.core.refinement import within
+from line_feature_node.core.refinement import COUNT_COLUMNS, COUNT_ROWS, NORM_BIN, NORM_BINS, count_norms, within
 
 Image = npt.NDArray[Any]
 Segments = npt.NDArray[np.void]
@@ -181,6 +181,15 @@ def test_no_edge_is_known_for_certain(degrees: float) -> None:
     [segment] = extract(picture(60 + 100 * half_plane(120, 120, degrees, 60.2, 60.2)))
     assert 1e-4 < segment['sigma_offset'] < 0.1
     assert 1e-6 < segment['sigma_theta'] < 1e-2
+
+
+@pytest.mark.parametrize('degrees', [0, 20, 45, 70, 110, 135])
+def test_orientation_and_offset_are_known_from_the_same_peaks(degrees: float) -> None:
+    """Of peaks that are spread evenly over a length l the one is known sqrt(12) / l times as well as the other."""
+    image = picture(60 + 100 * half_plane(80, 80, degrees, 39.3, 39.6), 4)
+    [segment] = extract(image)
+    ratio = segment['sigma_theta'] / segment['sigma_offset'] * segment['length']
+    assert ratio == pytest.approx(math.sqrt(12), rel=0.15)
 
 
 @pytest.mark.compiled
@@ -628,3 +637,12 @@ def test_a_line_that_is_nowhere_in_the_picture(slope: float, intercept: float, f
     assert high < low
     assert low >= 0
     assert high >= -1
+
+
+def test_norms_are_counted_from_the_top() -> None:
+    gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
+    counts = np.ones(NORM_BINS, np.int64)
+    count_norms(gradient, 2, 36, 46, counts)
+    norms = np.hypot(*np.moveaxis(gradient[2:38:COUNT_ROWS, 2:48:COUNT_COLUMNS], 2, 0))
+    assert counts[0] == norms.size
+    assert counts.tolist() == [np.count_nonzero(norms >= NORM_BIN * k) for k in range(NORM_BINS)]
