@@ -35,8 +35,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-
-# Beside this file.
 from node import PROFILE, Case, Row, Watched, environment, render
 
 if '--draw' not in sys.argv:
@@ -180,17 +178,23 @@ def replace(path: Path, value: Any) -> None:
 # The listener
 
 
-def listener(seed: int) -> None:
-    """Subscribe to one output after the other until the end, for up to a second and a half each."""
-    chance = random.Random(seed)
+def listener(life: int) -> None:
+    """Subscribe to one output after the other until the end, for up to a second and a half each.
+
+    In its first life, which a kill ends, to all of them: the node keeps the last messages of each for it until it is
+    given up, and what that takes belongs to the first minute.
+    """
+    chance = random.Random(life)
     kinds = {'segments': PointCloud2, 'markers': ImageMarker, 'overlay': Image, 'edges': Image,
              'overlay/compressed': CompressedImage}
     with spinning('listener') as (node, executor):
         while True:
-            for topic in chance.sample(list(kinds), len(kinds)):
-                subscription = node.create_subscription(kinds[topic], f'{NODE}/{topic}', lambda _: None, 5)
-                spin_until(time.monotonic_ns() + int(chance.uniform(0.1, 1.5) * 1e9), executor)
-                node.destroy_subscription(subscription)
+            for topics in [list(kinds)] if life == 0 else [[topic] for topic in chance.sample(list(kinds), len(kinds))]:
+                subscriptions = [node.create_subscription(kinds[topic], f'{NODE}/{topic}', lambda _: None, 5)
+                                 for topic in topics]
+                spin_until(time.monotonic_ns() + int(chance.uniform(0.1, 1.5) * 1e9 + (life == 0) * 1e12), executor)
+                for subscription in subscriptions:
+                    node.destroy_subscription(subscription)
 
 
 @contextlib.contextmanager
@@ -484,7 +488,17 @@ def table(made: list[Line]) -> str:
     return '\n'.join(f'| {" | ".join(row)} |' for row in rows)
 
 
-def draw(result: Row, path: Path) -> None:
+def seconds(result: Row) -> list[Row]:
+    """What is drawn of each second."""
+    names = ('time', 'resident', 'own', 'threads', 'descriptors')
+    rows = [{name: round(row[name], 2) for name in names} for row in result['samples']]
+    for row, latencies in zip(rows, result['latencies'], strict=True):
+        for percent in (50, 99):
+            row[f'p{percent}'] = round(float(np.percentile(latencies, percent)), 1) if latencies else None
+    return rows
+
+
+def draw(rows: list[Row], path: Path) -> None:
     """Memory, handles and latency over time; where matplotlib is missing, say so."""
     try:
         from matplotlib.figure import Figure
@@ -492,18 +506,17 @@ def draw(result: Row, path: Path) -> None:
         print(f'the curves are not drawn, as matplotlib is not installed: where it is, --draw {path.parent} draws them')
         return
     figure = Figure((15, 4.2), layout='constrained')
-    samples = result['samples']
-    times = [row['time'] for row in samples]
+    times = [row['time'] for row in rows]
     memory, handles, latency = figure.subplots(1, 3)
-    memory.plot(times, [row['resident'] for row in samples], label='resident, with what is shared')
-    memory.plot(times, [row['own'] for row in samples], label='its own')
+    memory.plot(times, [row['resident'] for row in rows], label='resident, with what is shared')
+    memory.plot(times, [row['own'] for row in rows], label='its own')
     memory.set(ylabel='MiB', title='memory of the node')
     for name in ('threads', 'descriptors'):
-        handles.plot(times, [row[name] for row in samples], label=name)
+        handles.plot(times, [row[name] for row in rows], label=name)
     handles.set(title='threads and descriptors of the node')
-    for percent in (99, 50):
-        values = [np.percentile(row or [np.nan], percent) for row in result['latencies']]
-        latency.plot(times, values, label=f'p{percent} of a second')
+    for name in ('p99', 'p50'):
+        values = [np.nan if row[name] is None else row[name] for row in rows]
+        latency.plot(times, values, label=f'{name} of a second')
     latency.set(ylabel='ms', title='latency')
     for axes in (memory, handles, latency):
         axes.set(xlabel='s', ylim=(0, None))
@@ -522,8 +535,9 @@ def run(options: argparse.Namespace) -> int:
     print(f'{options.minutes:g} min at {options.rate:g} Hz\n\n{table(made)}')
     if options.results:
         options.results.mkdir(parents=True, exist_ok=True)
-        (options.results / 'soak.json').write_text(json.dumps(result))
-        draw(result, options.results / 'soak.png')
+        rows = seconds(result)
+        (options.results / 'soak.json').write_text(json.dumps(rows))
+        draw(rows, options.results / 'soak.png')
     failed = [line.name for line in made if not line.met]
     if failed:
         print(f'not met: {", ".join(failed)}; the node said at last\n{result["log"]}', file=sys.stderr)
@@ -533,7 +547,7 @@ def run(options: argparse.Namespace) -> int:
 def main() -> int | None:
     roles: dict[str, Callable[..., None]] = {
         '--camera': lambda folder, life, rate: camera(Path(folder), int(life), float(rate)),
-        '--client': lambda folder: client(Path(folder)), '--listener': lambda seed: listener(int(seed))}
+        '--client': lambda folder: client(Path(folder)), '--listener': lambda life: listener(int(life))}
     if sys.argv[1:2] and sys.argv[1] in roles:
         return roles[sys.argv[1]](*sys.argv[2:])
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
