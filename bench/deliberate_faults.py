@@ -41,7 +41,9 @@ FAULTS = {
         ('start_weights(q, 2)', 'start_weights(q, 1)'),
         ('tail = 2 * r / (1 - r)', 'tail = r / (1 - r)'),
         ('along[i] = below[i] - above[i]', 'along[i] = above[i] - below[i]'),
-        ('kept[row + 1])', 'kept[row + 2])'),
+        ('kept[row + 1, 2 * first', 'kept[row + 2, 2 * first'),
+        ('HALO = 2', 'HALO = 1'),
+        ('if end == height:', 'if first == 0:'),
         ('CODE_2 if same else CODE_4', 'CODE_4 if same else CODE_2'),
         ('slack if code_1 | code_3 else -slack', 'slack'),
         ('target[width + PAD - 1]', 'target[width + PAD - 2]'),
@@ -118,6 +120,7 @@ FAULTS = {
     ],
     'scanning': [
         ('back = -1 if right else 1', 'back = 1 if right else -1'),
+        ('offsets[before:count + 1]', 'offsets[before + 1:count + 1]'),
         ('(mask & (mask - 1)) != 0 or ', ''),
         ('direction = (code + 1) % 4', 'direction = (code + 1) % 5'),
         ('(2 * span_y * k + steps)', '(2 * span_y * k)'),
@@ -141,6 +144,13 @@ FAULTS = {
         ('stop - start < min_size', 'stop - start <= min_size'),
         ('(size + UNIT - 1) // UNIT, n, sx', 'size // UNIT, n, sx'),
         ('+ (NOISE_DEVIATION', '- (NOISE_DEVIATION'),
+    ],
+    'team': [
+        ('[results[number] for number in range(len(results))]', 'list(results.values())'),
+        ('tools[thread:thread + 1]', 'tools[0:1]'),
+        ('own[number] if number in own else helper.result()', 'helper.result()'),
+        ('if first < end]', 'if first <= end]'),
+        ('not all(thread.is_alive() for thread in self._threads)', 'False'),
     ],
     'thinning': [
         ('for turn in range(4)', 'for turn in range(3)'),

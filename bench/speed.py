@@ -4,8 +4,9 @@
 
 One thread, all contestants in turn on the same picture in one run; of each picture the least processor time counts, of
 the pictures the median. Milliseconds differ between machines and hours: quote the ratios. Without photographs rendered
-corridors stand in for them, which have fewer edges than most. With a folder for results, two curves are measured and
-drawn as well (matplotlib): time by pixels, and by edge pixels at one size.
+corridors stand in for them, which have fewer edges than most. Then come contents that make some detectors slow, beside
+the median photograph of their size, and several threads on one frame beside one, by the wall clock. With a folder for
+results, two curves are measured and drawn as well (matplotlib): time by pixels, and by edge pixels at one size.
 """
 
 import argparse
@@ -30,6 +31,8 @@ SIZES = ((640, 480), (1280, 720), (1920, 1080))
 WIDTHS = (160, 320, 640, 960, 1280, 1920, 2560, 3840)
 #: How many rectangles the pictures of the curve by edge pixels have.
 DENSITIES = (0, 10, 30, 60, 120, 250, 500, 1000, 2000)
+#: Sizes of the contents that may be slow.
+CONTENT_SIZES = ((640, 480), (7680, 4320))
 PAPER = 'paper profile'
 CANNY = 'OpenCV Canny(50, 150)'
 
@@ -135,6 +138,59 @@ def curve_by_edges(reps: int) -> dict[str, list[float]]:
     return rows
 
 
+def contents(width: int, height: int) -> dict[str, Any]:
+    """Pictures of a size that are slow with some detectors."""
+    rng = np.random.default_rng(0)
+    rows, columns = np.indices((height, width), sparse=True)
+    lines, text = np.zeros((2, height, width), np.uint8)
+    for x in range(8, width, 160):
+        cv2.line(lines, (x, 0), (width - x, height - 1), 255)
+    for y in range(10, height, 12):
+        cv2.putText(text, 'Quick brown foxes jump over lazy dogs. ' * (width // 200 + 1), (2, y),
+                    cv2.FONT_HERSHEY_PLAIN, 0.8, 255)
+    found = {'black': np.zeros((height, width), np.uint8), 'bright lines on black': lines, 'text': text,
+             'checkerboard of 1 px': (255 * ((rows + columns) % 2)).astype(np.uint8),
+             'checkerboard of 4 px': (255 * ((rows // 4 + columns // 4) % 2)).astype(np.uint8),
+             'stripes of 3 px': np.broadcast_to(255 * (columns // 3 % 2), (height, width)).astype(np.uint8),
+             'black and white at random': (255 * rng.integers(0, 2, (height, width), np.uint8))}
+    noise = rng.standard_normal((height, width), np.float32)
+    return found | {f'noise of {sigma} grey levels': np.clip(noise * sigma + 128, 0, 255).astype(np.uint8)
+                    for sigma in (1, 3, 10, 30, 100)}
+
+
+def measure_contents(images: list[Any], reps: int) -> dict[str, dict[str, float]]:
+    """The best milliseconds of the default for each content, by size, and for the photographs their median."""
+    extractor = LineFeatureExtractor()
+    result = {}
+    for width, height in CONTENT_SIZES:
+        few = max(2, min(reps, reps * 640 * 480 // (width * height)))
+        photographs = [best_of(extractor.extract, fitted(image, width, height), few) for image in images]
+        result[f'{width}×{height}'] = {'photograph': float(np.median(photographs))} | {
+            name: best_of(extractor.extract, image, few) for name, image in contents(width, height).items()}
+    return result
+
+
+def measure_threads(images: list[Any], reps: int) -> dict[str, dict[str, float]]:
+    """Milliseconds by the wall clock with one thread and more on a frame, by size: medians over all frames."""
+    counts = [count for count in (1, 2, 4, 8) if count <= len(os.sched_getaffinity(0))]
+    extractors = {count: LineFeatureExtractor(Parameters(threads=count)) for count in counts}
+    result = {}
+    for width, height in SIZES:
+        times: dict[int, list[float]] = {count: [] for count in counts}
+        for image in images:
+            sized = fitted(image, width, height)
+            for extractor in extractors.values():
+                extractor.extract(sized)
+            for _ in range(reps):
+                for count, extractor in extractors.items():
+                    start = time.perf_counter()
+                    extractor.extract(sized)
+                    times[count].append(time.perf_counter() - start)
+        result[f'{width}×{height}'] = {f'{count} threads': float(np.median(values)) * 1e3
+                                       for count, values in times.items()}
+    return result
+
+
 def draw_curves(curves: dict[str, dict[str, list[float]]], path: Path) -> None:
     """Draw both curves side by side, each with the straight line that fits the whole best."""
     figure = Figure((11, 4.2), layout='constrained')
@@ -150,12 +206,17 @@ def draw_curves(curves: dict[str, dict[str, list[float]]], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def print_table(result: dict[str, dict[str, float]], title: str) -> None:
+def print_table(result: dict[str, dict[str, float]], title: str, unit: str) -> None:
+    """A row for each contestant, a column for each size; in parentheses the ratio to one of them."""
     print(title)
-    print(f'{"":24}' + ''.join(f'{size:>18}' for size in result))
+    print(f'{"":28}' + ''.join(f'{size:>20}' for size in result))
     for name in next(iter(result.values())):
-        cells = [f'{row[name]:.3f} ({row[name] / row[CANNY]:.2f})' for row in result.values()]
-        print(f'{name:24}' + ''.join(f'{cell:>18}' for cell in cells))
+        cells = [f'{row[name]:.3f} ({row[name] / row[unit]:.2f})' for row in result.values()]
+        print(f'{name:28}' + ''.join(f'{cell:>20}' for cell in cells))
+
+
+def print_ratios(result: dict[str, dict[str, float]]) -> None:
+    """What of the peers' times ours are."""
     for ours in ('all steps', PAPER):
         for name in peers():
             ratios = [f'{row[ours] / row[name]:.3f}' for row in result.values()]
@@ -169,17 +230,22 @@ def main() -> None:
     parser.add_argument('--results', type=Path)
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    if hasattr(os, 'sched_setaffinity'):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     images = pictures(options.photos)
+    threads = measure_threads(images, options.reps)
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     result = {f'{width}×{height}': measure([fitted(image, width, height) for image in images], options.reps)
               for width, height in SIZES}
     kind = 'photographs' if options.photos else 'rendered pictures'
-    print_table(result, f'{len(images)} {kind}, one thread, ms (ratio to Canny)')
+    print_table(result, f'{len(images)} {kind}, one thread, ms (ratio to Canny)', CANNY)
+    print_ratios(result)
+    slow = measure_contents(images, options.reps)
+    print_table(slow, '\ncontents, one thread, ms (ratio to a photograph)', 'photograph')
+    print_table(threads, '\nthreads on one frame, ms by the wall clock (ratio to one)', '1 threads')
     if options.results:
         curves = {'pixels': curve_by_pixels(images, options.reps), 'edge pixels': curve_by_edges(options.reps)}
         options.results.mkdir(parents=True, exist_ok=True)
-        (options.results / 'speed.json').write_text(json.dumps({'sizes': result, 'curves': curves}, indent=1))
+        (options.results / 'speed.json').write_text(json.dumps(
+            {'sizes': result, 'contents': slow, 'threads': threads, 'curves': curves}, indent=1))
         draw_curves(curves, options.results / 'speed.png')
         print(f'curves: {options.results / "speed.png"}')
 

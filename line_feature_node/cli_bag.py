@@ -1,5 +1,6 @@
 """The command `line_features bag`: recordings in, bags with segments out."""
 
+import dataclasses
 import json
 import math
 import signal
@@ -73,7 +74,9 @@ def bag(
         raise typer.BadParameter(f'storage must be mcap or sqlite3, got {storage!r}')
     try:
         pairs = list(_targets(recordings, find_recordings(recordings), out))
-        job = Job(parameters, _mask(mask_file, options), outputs=('segments',) if only_segments else tuple(OUTPUTS),
+        # Where several frames are worked on at the same time, threads on each would only stand in line.
+        job = Job(parameters if workers == 1 else dataclasses.replace(parameters, threads=1),
+                  _mask(mask_file, options), outputs=('segments',) if only_segments else tuple(OUTPUTS),
                   truth=truth, csv=csv, jpeg_quality=options.jpeg_quality)
         run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)
         if report:

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from line_feature_node.core import SEGMENT_DTYPE, STEPS, LineFeatureExtractor, Parameters, Stages, extract
+from line_feature_node.core import SEGMENT_DTYPE, STEPS, LineFeatureExtractor, Parameters, Stages, extract, pipeline
+from line_feature_node.scenes import Camera, corridor
 
 Image = npt.NDArray[Any]
 TYPES = [np.uint8, np.uint16, np.float32]
@@ -495,6 +496,86 @@ def test_extractors_in_threads() -> None:
                    for _ in range(3) for image, segments in zip(pictures, expected[k % 6], strict=True))
 
     assert all(together(8, work))
+
+
+# Threads on one frame
+
+def wide(height: int, width: int, sigma: float, kind: type = np.uint8) -> Any:
+    """A corridor of any size, in noise."""
+    image = cv2.cvtColor(corridor(Camera(), width=max(width, 64), height=max(height, 48)).image, cv2.COLOR_BGR2GRAY)
+    noisy = image[:height, :width] + np.random.default_rng(height).normal(0, sigma, (height, width))
+    scale = 257 if kind == np.uint16 else 1
+    return np.clip(np.rint(noisy) * scale, 0, 255 * scale).astype(kind)
+
+
+@pytest.mark.parametrize('parameters', [
+    {}, {'grouping': 'codes'}, {'refine': False}, {'operator': 'dog'}, {'alpha': 0.3}, {'profile': 'paper'},
+    {'thinning': 'morphological'}, {'thinning': 'none'}, {'scale': 0.7}, {'max_segments': 40},
+], ids=str)
+@pytest.mark.parametrize(('height', 'width', 'sigma'), [(1, 1, 0), (7, 300, 9), (300, 7, 9), (480, 640, 3), (
+    600, 337, 12), (1080, 1920, 5)])
+def test_threads_make_no_difference(
+    parameters: dict[str, Any], height: int, width: int, sigma: float, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The same bytes, and the same edges, however many work on a frame, and however small it is."""
+    monkeypatch.setattr(pipeline, 'LEAST_SHARED', 0)
+    image = wide(height, width, sigma)
+    chosen = Parameters.profile(parameters.get('profile', 'default'),
+                                **{name: value for name, value in parameters.items() if name != 'profile'})
+    alone = LineFeatureExtractor(chosen)
+    expected = alone.extract(image)
+    for threads in (2, 3, 7):
+        shared = LineFeatureExtractor(dataclasses.replace(chosen, threads=threads))
+        for _ in range(2):
+            assert same(shared.extract(image), expected)
+        np.testing.assert_array_equal(shared.edges(), alone.edges())
+
+
+@pytest.mark.parametrize('kind', [np.uint16, np.float32])
+def test_threads_make_no_difference_to_other_pixels(kind: type) -> None:
+    image = wide(720, 1280, 4, kind)
+    mask = np.ones(image.shape, np.uint8)
+    mask[200:300, 400:900] = 0
+    expected = LineFeatureExtractor().extract(image, mask)
+    assert len(expected) > 20
+    assert same(LineFeatureExtractor(Parameters(threads=2)).extract(image, mask), expected)
+
+
+def test_small_pictures_have_one_thread() -> None:
+    before = set(threading.enumerate())
+    extractor = LineFeatureExtractor(Parameters(threads=4))
+    extractor.extract(wide(480, 640, 4))
+    assert not set(threading.enumerate()) - before
+    extractor.extract(wide(720, 1280, 4))
+    assert set(threading.enumerate()) - before
+
+
+def test_threads_may_change_between_frames() -> None:
+    image = wide(720, 1280, 4)
+    extractor = LineFeatureExtractor()
+    expected = extractor.extract(image)
+    for threads in (3, 1, 2, 2, 1):
+        extractor.parameters = Parameters(threads=threads)
+        assert same(extractor.extract(image), expected)
+
+
+def test_stages_of_several_threads() -> None:
+    """They are those of one, and fit together."""
+    image = wide(1080, 640, 2)
+    stages, alone = (LineFeatureExtractor(Parameters(threads=threads)).stages(image) for threads in (2, 1))
+    for name in FRAMES:
+        assert getattr(stages, name).tobytes() == getattr(alone, name).tobytes(), name
+    assert stages.chain_offsets[-1] == len(stages.chain_pixels) == np.count_nonzero(stages.edges)
+    assert (np.diff(stages.chain_offsets) > 0).all()
+    inside = np.ones(len(stages.chain_pixels) - 1, bool)
+    inside[stages.chain_offsets[1:-1] - 1] = False
+    assert (np.abs(np.diff(stages.chain_pixels, axis=0)).max(1)[inside] == 1).all()
+    assert stages.blob_offsets[-1] == len(stages.blob_pixels)
+    for k, blob in enumerate(stages.blobs):
+        pixels = stages.blob_pixels[stages.blob_offsets[k]:stages.blob_offsets[k + 1]]
+        assert len(pixels) == blob['size']
+        assert (*pixels.min(0), *pixels.max(0)) == tuple(
+            blob[name] for name in ('min_col', 'min_row', 'max_col', 'max_row'))
 
 
 # What the extractor tells beside the segments.

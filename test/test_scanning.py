@@ -1,5 +1,6 @@
 import itertools
 import math
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.edges import MARGIN, STRONG
 from line_feature_node.core.parameters import Parameters
-from line_feature_node.core.scanning import TAKEN, chain_directions, scan_edges
+from line_feature_node.core.scanning import TAKEN, chain_directions, joined, scan_edges, trace_edges
 
 Pixel = tuple[int, int]
 
@@ -529,3 +530,24 @@ def test_min_chain_drops_whole_chains_and_changes_no_other(
 ) -> None:
     kept = [chain for chain in scan(codes, max_gap=max_gap) if len(chain.pixels) >= min_chain]
     assert scan(codes, max_gap=max_gap, min_chain=min_chain) == kept
+
+
+# In several goes
+
+@pytest.mark.parametrize('parts', [2, 3, 8, 200])
+@pytest.mark.parametrize(('filled', 'strong'), [(0.05, 0.5), (0.3, 0.02), (0.38, 0.002), (0, 0), (1, 0.001)])
+def test_edges_traced_in_several_goes_are_those_of_one(parts: int, filled: float, strong: float) -> None:
+    """Each chain comes once, as soon as the rows that its edge is found in are read."""
+    rng = np.random.default_rng(parts)
+    codes = np.where(rng.random((150, 90)) < filled, rng.integers(1, 5, (150, 90)), 0).astype(np.uint8)
+    whole = marks_of(codes, rng.random(codes.shape) < strong)
+    shared = whole.copy()
+    [one] = trace_edges(whole, 1, Buffers())
+    goes = list(trace_edges(shared, parts, Buffers()))
+    assert len(goes) == parts
+    np.testing.assert_array_equal(shared, whole)
+    for found, expected in zip(joined(goes), one, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    for before, after in pairwise(goes):
+        assert before.offsets[-1] == after.offsets[0]
+    assert sum(go.closed.size for go in goes) == one.closed.size

@@ -66,6 +66,15 @@ def extract_blobs(
     return Blobs(attributes, members, offsets, moments)
 
 
+def joined_blobs(parts: list[Blobs]) -> Blobs:
+    """The blobs of all parts of one list of edge pixels, one after the other, in arrays of their own."""
+    ends = np.cumsum([0] + [part.members.size for part in parts])
+    starts = [part.offsets[:-1] + end for part, end in zip(parts, ends[:-1], strict=True)]
+    return Blobs(np.concatenate([part.attributes for part in parts]), np.concatenate([part.members for part in parts]),
+                 np.concatenate([*starts, ends[-1:]]).astype(np.int32),
+                 np.concatenate([part.moments for part in parts]))
+
+
 @inlined
 def root(parents: Any, label: int) -> int:
     """The label that a label merged into at last, halving the way there for later."""

@@ -15,6 +15,13 @@ class Buffers:
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
+        self._parts: list[Buffers] = []
+
+    def parts(self, count: int) -> 'list[Buffers]':
+        """So much other memory, always the same, for parts of a frame that are worked on at the same time."""
+        while len(self._parts) < count:
+            self._parts.append(Buffers())
+        return self._parts[:count]
 
     def array(self, name: str, size: int, dtype: DTypeLike, *, zeros: bool = False) -> NDArray[Any]:
         """A one-dimensional array of at least that size, always the same one until a larger one is needed."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.parameters import Parameters
+from line_feature_node.core.team import ALONE, Team
 from line_feature_node.core.vectors import LANES, TILE, load, multiply, multiply_add, store, transpose
 
 #: In a mark: the direction code, 1 to 4, of a pixel that passed the suppression and exceeds T2; 0 is background.
@@ -28,6 +29,8 @@ STRONG = 8
 
 #: Replicated pixels on each side of a plane, and of zeros on each side of the marks.
 PAD, MARGIN = 2, 1
+#: Columns on both sides of a part of the picture whose smoothed grey levels tell on its edges.
+HALO = 2
 #: Pixels whose norms differ by less than this part count as equal, so that a ramp has no edge in its interior.
 FLAT = np.float32(1e-3)
 #: Norms that differ by less than this part, or this much, are a tie, which the first along the gradient wins: above
@@ -47,7 +50,9 @@ LARGEST, UNIT = 32767, 1 / 128
 PEDESTAL = 1.0
 
 
-def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers) -> NDArray[np.uint8]:
+def extract_edges(
+    image: NDArray[Any], parameters: Parameters, buffers: Buffers, team: Team = ALONE,
+) -> NDArray[np.uint8]:
     """Mark the edge candidates of an image.
 
     Hysteresis is left to edge scanning, which follows candidates from strong ones.
@@ -56,6 +61,7 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
         image: H×W uint8, uint16 or float32, C-contiguous.
         parameters: operator, alpha, sigma, T1, T2, thinning, intensity_min and intensity_max are used.
         buffers: Memory to work in.
+        team: Who does the work.
 
     Returns:
         Marks, uint8: the CODE of each pixel that passed the suppression (where that is the way of thinning) and
@@ -66,7 +72,6 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     # Whole strips of rows and whole tiles of columns fit in, with the padding.
     lines, columns = -(-height // LANES) * LANES, -(-(width + 2 * PAD) // TILE) * TILE
     plane = buffers.image('plane', lines + 2 * PAD, columns, np.float32)
-    rows = buffers.image('rows', 15, columns, np.float32)
     whole = image.dtype == np.uint8
     kept = buffers.image('gradient', lines + 2 * PAD if parameters.refine else 0, 2 * columns,
                          np.int16 if whole else np.float32)
@@ -78,8 +83,7 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
     recursive = parameters.operator == 'deriche'
     if recursive:
         side, centre = deriche_stencil(parameters.alpha)
-        strip = buffers.array('strip', columns * LANES, np.float32)
-        smooth_forward(image, scale, offset + PEDESTAL, q, strip, plane, rows[0])
+        smooth_image(image, scale, offset + PEDESTAL, q, plane, buffers, team)
     else:
         side, centre = STENCILS[parameters.operator]
         copy_replicated(image, scale, offset, plane)
@@ -90,9 +94,43 @@ def extract_edges(image: NDArray[Any], parameters: Parameters, buffers: Buffers)
         plane = smoothed
     unit = buffers.array('unit', 1, np.float64)
     unit[0] = abs(scale) * 255 / LARGEST if whole else UNIT
-    sweep(height, width, recursive, q, side, centre, parameters.T1, parameters.T2,
-          parameters.thinning == 'suppression', plane, rows, 1 / unit[0], whole, kept, marks)
+    thin = parameters.thinning == 'suppression'
+
+    def sweep_some(left: int, right: int, memory: Buffers) -> None:
+        seen = min(right + HALO, columns) - max(left - HALO, 0)
+        sweep(height, width, left, right, recursive, q, side, centre, parameters.T1, parameters.T2, thin, plane,
+              memory.array('rows', 14 * columns, np.float32)[:14 * seen].reshape(14, seen), 1 / unit[0], whole, kept,
+              marks)
+
+    team.each(sweep_some, team.shares(columns, TILE), buffers.parts(team.size))
     return marks
+
+
+def smooth_image(
+    image: NDArray[Any], scale: float, offset: float, q: float, plane: NDArray[np.float32], buffers: Buffers,
+    team: Team,
+) -> None:
+    """Smooth the rows by E * E, and the columns by its causal half; the sweep does the other half on its way up.
+
+    The causal half needs all rows before. So one of a team does both in its part of the rows, the first, while others
+    smooth those below, and then all go down the columns there.
+    """
+    height, columns = image.shape[0], plane.shape[1]
+    last = buffers.array('last row', columns, np.float32)
+    # A low picture is one part.
+    below = (height // LANES // team.size * LANES if team.size > 1 else 0) or height
+
+    def smooth_some(first: int, end: int, memory: Buffers) -> None:
+        strip = memory.array('strip', columns * LANES, np.float32)
+        smooth_strips(image, first, end, first == 0, scale, offset, q, strip, plane, last)
+
+    def go_down_some(left: int, right: int) -> None:
+        smooth_down(below, height, left, right, height, q, plane, last)
+
+    shares = [(below + first, below + end) for first, end in team.shares(height - below, LANES)]
+    team.each(smooth_some, [(0, below), *shares], buffers.parts(team.size))
+    if shares:
+        team.each(go_down_some, team.shares(columns, TILE))
 
 
 class Gradient(NamedTuple):
@@ -158,27 +196,46 @@ def copy_replicated(image: Any, scale: float, offset: float, plane: Any) -> None
 
 
 @kernel
-def smooth_forward(image: Any, scale: float, offset: float, q: float, strip: Any, plane: Any, last: Any) -> None:
-    """Smooth the rows by E * E, and the columns by its causal half; the sweep does the other half on its way up.
+def smooth_strips(
+    image: Any, first: int, end: int, downwards: bool, scale: float, offset: float, q: float, strip: Any, plane: Any,
+    last: Any,
+) -> None:
+    """Smooth rows from the first to the end, and, if asked for, down the columns as :func:`smooth_down`.
 
-    The two rows below the image receive the start values of that half. The strip holds LANES rows, column after
-    column, as many columns as the plane has.
+    The strip holds LANES rows, column after column, as many columns as the plane has.
     """
     height, width = image.shape
-    for first in range(0, height, LANES):
-        load_rows(image, first, np.float32(scale), np.float32(offset), plane)
-        turn(plane, first + PAD, strip)
+    for row in range(first, end, LANES):
+        load_rows(image, row, np.float32(scale), np.float32(offset), plane)
+        turn(plane, row + PAD, strip)
         smooth_strip(strip, width, np.float32(q))
-        turn_back(strip, plane, first + PAD)
-        if first == 0:
-            copy_row(plane[PAD], plane[0])
-            copy_row(plane[PAD], plane[1])
-        for row in range(first + PAD, min(first + LANES, height) + PAD):
-            if row == height + PAD - 1:
-                copy_row(plane[row], last)
-            recur(plane[row], plane[row - 1], plane[row - 2], np.float32(q))
+        turn_back(strip, plane, row + PAD)
+        if downwards:
+            go_down(row, min(row + LANES, end), 0, plane.shape[1], height, np.float32(q), plane, last)
+
+
+@kernel
+def smooth_down(
+    first: int, end: int, left: int, right: int, height: int, q: float, plane: Any, last: Any,
+) -> None:
+    """Smooth columns, of the plane, by the causal half of E * E, in rows of the image."""
+    go_down(first, end, left, right, height, np.float32(q), plane, last)
+
+
+@inlined
+def go_down(first: int, end: int, left: int, right: int, height: int, q: Any, plane: Any, last: Any) -> None:
+    """As :func:`smooth_down`. The two rows below the image receive the start values of the other half."""
+    if first == 0:
+        copy_row(plane[PAD, left:right], plane[0, left:right])
+        copy_row(plane[PAD, left:right], plane[1, left:right])
     bottom = height + PAD - 1
-    start_upwards(last, plane[bottom], plane[bottom - 1], plane[bottom + 1], plane[bottom + 2], np.float32(q))
+    for row in range(first + PAD, end + PAD):
+        if row == bottom:
+            copy_row(plane[row, left:right], last[left:right])
+        recur(plane[row, left:right], plane[row - 1, left:right], plane[row - 2, left:right], q)
+    if end == height:
+        start_upwards(last[left:right], plane[bottom, left:right], plane[bottom - 1, left:right],
+                      plane[bottom + 1, left:right], plane[bottom + 2, left:right], q)
 
 
 @inlined
@@ -288,32 +345,38 @@ def start_upwards(x: Any, u: Any, u1: Any, v1: Any, v2: Any, q: Any) -> None:
 
 @kernel
 def sweep(
-    height: int, width: int, recursive: bool, q: float, side: float, centre: float, T1: float, T2: float, thin: bool,
-    plane: Any, rows: Any, per_unit: float, whole: bool, kept: Any, marks: Any,
+    height: int, width: int, left: int, right: int, recursive: bool, q: float, side: float, centre: float, T1: float,
+    T2: float, thin: bool, plane: Any, rows: Any, per_unit: float, whole: bool, kept: Any, marks: Any,
 ) -> None:
     """From the bottom up: finish the smoothing of a row, then gradient, norm and suppression of the rows below it.
 
     Three rows each of the smoothed image, of the gradient and of the norm are used in turn. The gradient is kept if
     there is room. But for that only a few rows are written besides the marks; to smooth the plane in place would push
-    the marks out of the cache, which are read next.
+    the marks out of the cache, which are read next. It takes columns of the plane from the left to the right one, and
+    looks at HALO more on both sides.
     """
+    low, high = max(left - HALO, 0), min(right + HALO, plane.shape[1])
+    # The outermost columns of the plane have no neighbours, and no gradient.
+    first, end = max(left, 1), min(right, plane.shape[1] - 1)
+    first_pixel, end_pixel = max(left - PAD, 0), min(right - PAD, width)
     b, a = np.float32(side), np.float32(centre)
-    across, along, norm, smooth, gx, gy = rows[1], rows[2], rows[3:6], rows[6:9], rows[9:12], rows[12:15]
+    across, along, norm, smooth, gx, gy = rows[0], rows[1], rows[2:5], rows[5:8], rows[8:11], rows[11:14]
     for row in (height + PAD, height + PAD + 1):
-        copy_row(plane[row], smooth[row % 3])
+        copy_row(plane[row, low:high], smooth[row % 3])
     for row in range(height + PAD - 1, -1, -1):
         below, middle, above = row % 3, (row + 2) % 3, (row + 1) % 3
         if recursive:
-            recur_into(plane[row], smooth[above], smooth[middle], smooth[below], np.float32(q))
+            recur_into(plane[row, low:high], smooth[above], smooth[middle], smooth[below], np.float32(q))
         else:
-            copy_row(plane[row], smooth[below])
+            copy_row(plane[row, low:high], smooth[below])
         combine_columns(smooth[below], smooth[above], smooth[middle], b, a, across, along)
         gradient(across, along, b, a, gx[above], gy[above], norm[above])
         if kept.size > 0:
-            keep(gx[above], gy[above], np.float32(per_unit), whole, kept[row + 1])
+            keep(gx[above, first - low:end - low], gy[above, first - low:end - low], np.float32(per_unit), whole,
+                 kept[row + 1, 2 * first:2 * end])
         if row < height:
             suppress(norm[above], norm[middle], norm[below], gx[middle], gy[middle], np.float32(T1), np.float32(T2),
-                     thin, marks[row + MARGIN, MARGIN:MARGIN + width])
+                     thin, marks[row + MARGIN, MARGIN + first_pixel:MARGIN + end_pixel])
 
 
 @inlined

@@ -13,8 +13,8 @@ from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.edges import STENCILS, deriche_stencil, intensity_map
 from line_feature_node.core.parameters import Parameters
 
-#: The noise is measured in this many rows, or a few more, and in one of at least so many.
-ROWS, EVERY = 30, 16
+#: The noise is measured in this many rows, or a few more, and in one of at least so many; in about so many columns.
+ROWS, EVERY, COLUMNS = 30, 16, 640
 #: Bins of the histogram that the median is taken from, and how many there are to a grey level.
 BINS, RESOLUTION = 4096, 4
 #: The median of |x| of a normal distribution, in standard deviations.
@@ -121,12 +121,11 @@ def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
     for k in range(BINS):
         counts[0, k], counts[1, k] = 0, 0
     total = 0
-    every = max(height // ROWS, EVERY)
-    for row in range(min(1 + every // 2, height // 2), height - 1, every):
-        if row < 1:
-            continue
+    every, turns = max(height // ROWS, EVERY), max(width // COLUMNS, 1)
+    for row in range(max(min(1 + every // 2, height // 2), 1), height - 1, every):
         above, middle, below = image[row - 1], image[row], image[row + 1]
-        for i in range(1, width - 1):
+        # Rows take turns at the columns, or a pattern that repeats would be seen at one place of it only.
+        for i in range(1 + row // every % turns, width - 1, turns):
             if keep.size > 0 and not (keep[row - 1, i] and keep[row, i] and keep[row + 1, i]
                                       and keep[row, i - 1] and keep[row, i + 1]):
                 continue

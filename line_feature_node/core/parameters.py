@@ -191,6 +191,8 @@ class Parameters(ParameterSet):
     scale: float = parameter(
         1.0, 'The picture is made smaller by this factor first; segments come in pixels of the full size, while '
         'parameters in pixels, but for min_length and roi, are in those of the smaller picture.', low=0.05, high=1.0)
+    threads: int = parameter(
+        1, 'So many threads work on one frame, from half a megapixel on; the segments are the same.', low=1, high=64)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from line_feature_node.core.blobs import extract_blobs
+from line_feature_node.core.blobs import Blobs, extract_blobs, joined_blobs
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.edges import CODE, MARGIN, PAD, STRONG, extract_edges, kept_gradient
 from line_feature_node.core.features import compute_lines, segments_of
@@ -21,10 +21,11 @@ from line_feature_node.core.linking import link_lines
 from line_feature_node.core.noise import adapted, correlation_length, gradient_noise, measure, step_response
 from line_feature_node.core.normalization import normalize_codes
 from line_feature_node.core.parameters import Parameters
-from line_feature_node.core.refinement import Ridges, refine_lines
-from line_feature_node.core.scanning import BRIDGED, TAKEN, chain_directions, scan_edges
+from line_feature_node.core.refinement import Guesses, Ridges, first_guesses, refine_lines
+from line_feature_node.core.scanning import BRIDGED, TAKEN, Chains, chain_directions, joined, scan_edges, trace_edges
 from line_feature_node.core.selection import check_mask, enlarged, filled, placed, region, selected, smaller
 from line_feature_node.core.splitting import deviation_variance, split_chains
+from line_feature_node.core.team import ALONE, Team
 from line_feature_node.core.thinning import thin, unscanned
 
 #: What a frame goes through, as `times` names it: `input` is the check, the conversion to grey and the measuring of the
@@ -37,6 +38,10 @@ PIXEL_TYPES = (np.uint8, np.uint16, np.float32)
 #: Told the result of each step.
 Watch = Callable[[str, Any], None]
 
+#: Pixels from which on several threads work on a frame: they would wait for each other longer than they save.
+LEAST_SHARED = 2**19
+#: Parts in which a team has edges traced.
+PARTS = 8
 #: Pixels an image may have: positions are 32-bit numbers.
 MOST_PIXELS = 2**30
 
@@ -134,6 +139,7 @@ class LineFeatureExtractor:
         self.times = dict.fromkeys(STEPS, 0.0)
         self.unlinked = 0
         self._buffers = Buffers()
+        self._team = ALONE
         self._busy = threading.Lock()
         self._view = View()
         self._marks: NDArray[np.uint8] = np.zeros((2 * MARGIN, 2 * MARGIN), np.uint8)
@@ -207,6 +213,12 @@ class LineFeatureExtractor:
         segments = self._run(image, mask, keep)
         return _stages(kept, segments)
 
+    def _team_for(self, pixels: int) -> Team:
+        """The threads that the parameters ask for, for a picture that is large enough."""
+        if self._team.size != self.parameters.threads:
+            self._team = Team(self.parameters.threads)
+        return self._team if pixels >= LEAST_SHARED else ALONE
+
     def _run(self, image: NDArray[Any], mask: NDArray[Any] | None, watch: Watch) -> NDArray[np.void]:
         """The pipeline, for one frame at a time: two in the same memory would end the process."""
         if not self._busy.acquire(blocking=False):
@@ -220,12 +232,13 @@ class LineFeatureExtractor:
         """The steps in their order; `watch` sees the result of each before the next one works on it."""
         buffers = self._buffers
         grey, keep, view = working_picture(image, mask, self.parameters, buffers)
+        team = self._team_for(grey.size)
         p, noise = self.parameters, 0.0
         if p.refine or p.adaptive or p.grouping == 'straightness':
             quality = measure(grey, p, buffers, keep)
             p, noise = adapted(p, quality), quality.noise
         watch('input', grey)
-        marks = extract_edges(grey, p, buffers)
+        marks = extract_edges(grey, p, buffers, team)
         self._view, self._marks = view, marks
         if keep is not None:
             inner = marks[MARGIN:MARGIN + grey.shape[0], MARGIN:MARGIN + grey.shape[1]]
@@ -233,30 +246,91 @@ class LineFeatureExtractor:
         if p.thinning == 'morphological':
             thin(marks)
         watch('edges', marks)
-        chains = unscanned(marks) if p.thinning == 'none' else scan_edges(marks, p, buffers)
-        watch('scanning', (chains, marks))
-        by_codes = p.grouping == 'codes' or p.thinning == 'none'
-        normalize_codes(chains, p.n if by_codes else 0)
-        watch('normalization', chains.codes)
-        if by_codes:
-            blobs = extract_blobs(chains.pixels, chains.codes, chains.bridged, marks.shape, MARGIN, buffers)
-        else:
-            variance = deviation_variance(noise * gradient_noise(p), p.T1)
-            blobs = split_chains(chains, variance, marks.shape[1], MARGIN, p.min_size, buffers)
-        watch('blobs', blobs)
-        lines, count = compute_lines(blobs, grey.shape, p, buffers)
-        watch('features', lines[:count])
-        self.unlinked = count
-        if p.refine:
+        ridges = _ridges(grey.shape, keep, noise, p, buffers) if p.refine else None
+        if ridges is None:
+            lines, self.unlinked = lines_of_edges(marks, grey.shape, noise, p, buffers, watch)
+            segments = segments_of(lines, link_lines(lines, self.unlinked, grey.shape, p, buffers))
             watch('linking', None)
-            segments = refine_lines(lines, count, _ridges(grey.shape, keep, noise, p, buffers), p, buffers)
         else:
-            segments = segments_of(lines, link_lines(lines, count, grey.shape, p, buffers))
-            watch('linking', None)
+            if team.size > 1 and p.grouping == 'straightness' and p.thinning != 'none':
+                guesses = shared_guesses(marks, grey.shape, noise, ridges, p, buffers, team, watch)
+            else:
+                lines, count = lines_of_edges(marks, grey.shape, noise, p, buffers, watch)
+                watch('linking', None)
+                guesses = [first_guesses(lines, count, ridges, buffers)]
+            self.unlinked = sum(part.strengths.size for part in guesses)
+            segments = refine_lines(guesses, ridges, p, buffers, team)
         watch('refinement', segments)
         if not view.whole:
             segments = placed(segments, view.x, view.y, view.across, view.down)
         return selected(segments, p)
+
+
+def lines_of_edges(
+    marks: NDArray[np.uint8], shape: tuple[int, int], noise: float, parameters: Parameters, buffers: Buffers,
+    watch: Watch,
+) -> tuple[NDArray[np.void], int]:
+    """Steps 2 to 5, from edge scanning to line features.
+
+    Args:
+        marks: As edge extraction leaves them.
+        shape: Rows and columns of the picture.
+        noise: Standard deviation, in grey levels.
+        parameters: Adapted to the picture.
+        buffers: Memory to work in.
+        watch: Sees the result of each step.
+
+    Returns:
+        LINE_DTYPE, and how many there are.
+    """
+    p = parameters
+    by_codes = p.grouping == 'codes' or p.thinning == 'none'
+    chains = unscanned(marks) if p.thinning == 'none' else scan_edges(marks, p, buffers)
+    watch('scanning', (chains, marks))
+    normalize_codes(chains, p.n if by_codes else 0)
+    watch('normalization', chains.codes)
+    if by_codes:
+        blobs = extract_blobs(chains.pixels, chains.codes, chains.bridged, marks.shape, MARGIN, buffers)
+    else:
+        blobs = split_chains(chains, _deviation(noise, p), marks.shape[1], MARGIN, p.min_size, buffers)
+    watch('blobs', [blobs])
+    lines = compute_lines(blobs, shape, p, buffers)
+    watch('features', [lines])
+    return lines
+
+
+def shared_guesses(
+    marks: NDArray[np.uint8], shape: tuple[int, int], noise: float, ridges: Ridges, parameters: Parameters,
+    buffers: Buffers, team: Team, watch: Watch,
+) -> list[Guesses]:
+    """Steps 2 to 5, and the look at the gradient along the lines, all at the same time.
+
+    One of a team traces edges; the others make first guesses of them meanwhile. `watch` sees all when it is done.
+    """
+    parts: list[Chains] = []
+
+    def traced() -> Iterator[tuple[Chains, Buffers]]:
+        for chains, memory in zip(trace_edges(marks, PARTS, buffers), buffers.parts(PARTS), strict=True):
+            parts.append(chains)
+            yield chains, memory
+
+    def guess(chains: Chains, memory: Buffers) -> tuple[Blobs, tuple[NDArray[np.void], int], Guesses]:
+        p = parameters
+        blobs = split_chains(chains, _deviation(noise, p), marks.shape[1], MARGIN, p.min_size, memory)
+        lines = compute_lines(blobs, shape, p, memory)
+        return blobs, lines, first_guesses(*lines, ridges, memory)
+
+    blobs, lines, guesses = zip(*team.pipe(guess, traced()), strict=True)
+    chains = joined(parts)
+    for step, result in (('scanning', (chains, marks)), ('normalization', chains.codes), ('blobs', blobs),
+                         ('features', lines), ('linking', None)):
+        watch(step, result)
+    return list(guesses)
+
+
+def _deviation(noise: float, parameters: Parameters) -> float:
+    """Variance of the distance of edge pixels from their line."""
+    return deviation_variance(noise * gradient_noise(parameters), parameters.T1)
 
 
 def _ridges(
@@ -329,9 +403,10 @@ def _check(image: Any) -> None:
 
 def _stages(kept: dict[str, Any], segments: NDArray[np.void]) -> Stages:
     """Bring what was kept of the steps from padded arrays and flat indices to pixels of the image."""
-    grey, marks, lines = kept['input'], kept['edges'], kept['features']
+    grey, marks = kept['input'], kept['edges']
     chains, visited = kept['scanning']
-    blobs = kept['blobs']
+    blobs = joined_blobs(kept['blobs'])
+    lines = np.concatenate([part[:count] for part, count in kept['features']])
     height, width = grey.shape
     inside = slice(MARGIN, MARGIN + height), slice(MARGIN, MARGIN + width)
     candidates = (marks & CODE)[inside]

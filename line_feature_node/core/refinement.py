@@ -21,6 +21,7 @@ from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.features import SEGMENT_DTYPE, VERTICAL, points_up
 from line_feature_node.core.parameters import Parameters
+from line_feature_node.core.team import Team
 
 #: A line while it grows.
 RIDGE_DTYPE = np.dtype([
@@ -78,6 +79,8 @@ HOPE, GROWN = 0.45, 0.85
 #: Claims are kept in cells of so many pixels squared. A line claims those within this distance, in pixels; a line of
 #: which more than this part is claimed is dropped.
 CELL, CLAIM, CLAIMED = 2, 2.0, 0.6
+#: In place of its size: it is not known yet what a line grows to.
+PENDING = -1
 #: Between the centres of two pixels.
 HALF = 0.5
 #: Single precision is enough for what is seen of the gradient, and for sums along a line; with double precision most of
@@ -95,8 +98,9 @@ SAME_DIRECTION = 9
 INDEPENDENT = 0.8
 #: Peaks are known to a fiftieth of a pixel at best, in whole grey levels.
 LEAST_VARIANCE = 0.02**2
-#: Norms are counted in every so many rows and columns, in bins of so many units of the gradient.
-COUNT_ROWS, COUNT_COLUMNS, NORM_BINS, NORM_BIN = 8, 2, 4096, 4
+#: Norms are counted in every so many rows and columns, fewer where more than so many of each would be, in bins of so
+#: many units of the gradient.
+COUNT_ROWS, COUNT_COLUMNS, MOST_ROWS, MOST_COLUMNS, NORM_BINS, NORM_BIN = 8, 2, 60, 320, 4096, 4
 #: No gradient is rarer than this share of the pixels, as so many are looked at.
 RAREST = 1e-4
 
@@ -122,35 +126,78 @@ class Ridges(NamedTuple):
     correlation: float
 
 
+class Guesses(NamedTuple):
+    """First guesses. The arrays are the extractor's own.
+
+    Attributes:
+        ridges: RIDGE_DTYPE.
+        strengths: float32, how clear each is.
+    """
+
+    ridges: NDArray[np.void]
+    strengths: NDArray[np.float32]
+
+
+def first_guesses(lines: NDArray[np.void], count: int, ridges: Ridges, buffers: Buffers) -> Guesses:
+    """Look at the gradient along lines.
+
+    Args:
+        lines: LINE_DTYPE.
+        count: How many there are.
+        ridges: The gradient.
+        buffers: Memory to work in.
+    """
+    guesses = Guesses(buffers.array('first ridges', count, RIDGE_DTYPE)[:count],
+                      buffers.array('strengths', count, np.float32)[:count])
+    gradient = ridges.gradient
+    lay(lines, gradient.reshape(-1), 2 * gradient.shape[1], ridges.pad, ridges.height, ridges.width, *guesses)
+    return guesses
+
+
 def refine_lines(
-    lines: NDArray[np.void], count: int, ridges: Ridges, parameters: Parameters, buffers: Buffers,
+    parts: list[Guesses], ridges: Ridges, parameters: Parameters, buffers: Buffers, team: Team,
 ) -> NDArray[np.void]:
     """Align, grow, claim and judge.
 
     Args:
-        lines: LINE_DTYPE, first guesses.
-        count: How many there are.
+        parts: First guesses.
         ridges: The gradient, and what is known of its noise.
         parameters: min_snr and false_alarms are used.
         buffers: Memory to work in.
+        team: Who does the work.
 
     Returns:
         SEGMENT_DTYPE, strongest first guess first, a new array.
     """
     gradient, pad, height, width, noise, step, correlation = ridges
     flat, stride = gradient.reshape(-1), 2 * gradient.shape[1]
-    grown = buffers.array('ridges', count, RIDGE_DTYPE)[:count]
-    strengths = buffers.array('strengths', count, np.float32)[:count]
-    lay(lines, flat, stride, pad, height, width, grown, strengths)
+    grown, strengths = parts[0]
+    if len(parts) > 1:
+        strengths = np.concatenate([part.strengths for part in parts])
+        grown = buffers.array('ridges', strengths.size, RIDGE_DTYPE)[:strengths.size]
+        # Records would be copied field by field.
+        np.concatenate([part.ridges.view(np.uint8) for part in parts], out=grown.view(np.uint8))
     # The first bits of floats are in their order, and sorted faster, by counting.
     order = np.argsort(~(strengths.view(np.uint32) >> 16).astype(np.uint16), kind='stable')
-    claims = buffers.array('claims', height * width, np.uint8)[:-(-height // CELL) * -(-width // CELL)]
-    values = buffers.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
     counts = buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS]
     count_norms(gradient, pad, height, width, counts)
     tests = 2 * math.log10(height * width)
     least = parameters.min_snr * noise, tests - math.log10(parameters.false_alarms)
-    grow(order, counts, least, flat, stride, pad, height, width, noise, claims, values, grown)
+
+    guesses = grown
+
+    def grow_some(some: NDArray[np.int64], memory: Buffers) -> None:
+        claims = memory.array('claims', height * width, np.uint8)[:-(-height // CELL) * -(-width // CELL)]
+        values = memory.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
+        grow(some, guesses, counts, least, flat, stride, pad, height, width, noise, claims, values, grown)
+
+    if team.size > 1:
+        guesses = buffers.array('guesses', grown.size, RIDGE_DTYPE)[:grown.size]
+        guesses.view(np.uint8)[:] = grown.view(np.uint8)
+        # Neighbours in the list are so in the picture: in parts of the list most lines claim what they would in all.
+        team.each(grow_some, [(order[(order >= first) & (order < end)],) for first, end in team.shares(grown.size)],
+                  buffers.parts(team.size))
+    grow_some(order, buffers)
     kept = judge(least, counts, order, grown)
     segments = np.empty(kept, SEGMENT_DTYPE)
     write(order, grown, step, correlation, tests, counts, segments)
@@ -474,35 +521,55 @@ def lay(
         response = mean_response(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q)
         if response < 0:
             line['sign'], response = -1.0, -response
-        line['response'] = response
-        line['alive'] = False
+        line['response'], line['size'], line['alive'] = response, PENDING, False
         strengths[k] = response * math.sqrt(line['last'] - line['first'])
 
 
 @kernel
 def grow(
-    order: Any, counts: Any, least: tuple[float, float], gradient: Any, stride: int, pad: int, height: int,
-    width: int, noise: float, claims: Any, values: Any, grown: Any,
+    order: Any, guesses: Any, counts: Any, least: tuple[float, float], gradient: Any, stride: int, pad: int,
+    height: int, width: int, noise: float, claims: Any, values: Any, grown: Any,
 ) -> None:
-    """Let the lines that may become clear enough grow, in their order; those alive at the end are there once."""
-    origin = pad * (stride + 2)
+    """Let the first guesses that may become clear enough grow, in their order; those alive at the end are there once.
+
+    How a guess grows does not depend on the others, but whether it need grow does. So what has grown before, by the
+    claims of some lines only, is looked up when all lines are gone through, and need not grow again.
+
+    Args:
+        order: Places of the guesses, strongest first.
+        guesses: They stay as they are; or they are what has grown itself, where nothing has grown before.
+        grown: What becomes of them, at the same places: its size is PENDING of what has not grown yet, or need not
+            by the claims so far, and 0 where nothing comes of it.
+    """
     for k in range(claims.size):
         claims[k] = 0
     for k in order:
-        line = grown[k]
-        if not is_clear(line, counts, HOPE * least[0], HOPE * least[1]):
+        guess, line = guesses[k], grown[k]
+        line['alive'] = False
+        if line['size'] == PENDING and not is_clear(guess, counts, HOPE * least[0], HOPE * least[1]):
+            line['size'] = 0
+        if line['size'] == 0 or claimed(guess, claims, height, width) > CLAIMED:
             continue
-        if claimed(line, claims, height, width) > CLAIMED:
-            continue
-        in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], origin, stride, height, width)
-        grow_line(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
-        line['size'] = 0
-        if line['last'] - line['first'] >= SHORTEST_GROWING and is_clear(line, counts, GROWN * least[0],
-                                                                         GROWN * least[1]):
-            settle(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
+        if line['size'] == PENDING:
+            grown[k] = guess
+            grow_guess(line, counts, GROWN * least[0], GROWN * least[1], gradient, stride, pad, height, width, noise,
+                       values)
         if line['size'] > 0 and claimed(line, claims, height, width) <= CLAIMED:
             line['alive'] = True
             claim(line, claims, height, width)
+
+
+@inlined
+def grow_guess(
+    line: Any, counts: Any, least_strength: float, least_evidence: float, gradient: Any, stride: int, pad: int,
+    height: int, width: int, noise: float, values: Any,
+) -> None:
+    """Let a first guess grow, and lay it along the peaks if it is as clear as that; its size is 0 if it is not."""
+    in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], pad * (stride + 2), stride, height, width)
+    grow_line(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
+    line['size'] = 0
+    if line['last'] - line['first'] >= SHORTEST_GROWING and is_clear(line, counts, least_strength, least_evidence):
+        settle(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
 
 
 @kernel
@@ -620,10 +687,12 @@ def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -
     """Count how many of the pixels that are looked at have a norm of each bin, or a larger one."""
     for k in range(counts.size):
         counts[k] = 0
-    for row in range(pad, height + pad, COUNT_ROWS):
-        for column in range(pad, width + pad, COUNT_COLUMNS):
-            x, y = np.float32(gradient[row, column, 0]), np.float32(gradient[row, column, 1])
-            counts[norm_bin(math.sqrt(x * x + y * y))] += 1
+    rows, turns = max(height // MOST_ROWS, COUNT_ROWS), max(width // (COUNT_COLUMNS * MOST_COLUMNS), 1)
+    for row in range(0, height, rows):
+        # Rows take turns at the columns, or a pattern that repeats would be seen at one place of it only.
+        for column in range(COUNT_COLUMNS * (row // rows % turns), width, COUNT_COLUMNS * turns):
+            x, y = gradient[row + pad, column + pad, 0], gradient[row + pad, column + pad, 1]
+            counts[norm_bin(math.sqrt(np.float32(x) * x + np.float32(y) * y))] += 1
     for k in range(counts.size - 2, -1, -1):
         counts[k] += counts[k + 1]
 
@@ -653,8 +722,9 @@ def judge(least: tuple[float, float], counts: Any, order: Any, grown: Any) -> in
     left = 0
     for k in order:
         line = grown[k]
-        line['alive'] &= length_of(line) >= SHORTEST and is_clear(line, counts, least[0], least[1])
-        left += line['alive']
+        if line['alive']:
+            line['alive'] = length_of(line) >= SHORTEST and is_clear(line, counts, least[0], least[1])
+            left += line['alive']
     return left
 
 

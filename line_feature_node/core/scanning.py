@@ -10,7 +10,9 @@ alike it takes the one that turns back, as a digital straight line does. What it
 its own, so all that is connected to a strong pixel is visited: that is the hysteresis.
 """
 
+from collections.abc import Iterator
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,29 +128,56 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
     Returns:
         The chains of at least min_chain pixels; all as they were traced where lines are refined.
     """
+    [raw] = trace_edges(marks, 1, buffers)
+    if parameters.refine:
+        return raw
     flat = marks.reshape(-1)
     stride = marks.shape[1]
-    most = int(np.count_nonzero(flat))
-    raw_pixels, raw_codes = buffers.array('raw pixels', most, np.int32), buffers.array('raw codes', most, np.uint8)
-    raw_offsets = buffers.array('raw offsets', most + 1, np.int32)
-    raw = trace(flat, flat.view(np.uint64), stride, NEXT_STATE, _state_steps(stride), raw_pixels, raw_codes,
-                raw_offsets, buffers.array('stack', most, np.int32))
-    if parameters.refine:
-        length = raw_offsets[raw]
-        return Chains(raw_pixels[:length], raw_codes[:length],
-                      buffers.array('not bridged', length, np.bool_, zeros=True)[:length], raw_offsets[:raw + 1],
-                      buffers.array('not closed', raw, np.bool_, zeros=True)[:raw])
-    links = buffers.array('links', 2 * raw, np.int32)
-    link_gaps(flat, stride, raw, parameters.max_gap, FAN, FAN_OFFSETS, raw_pixels, raw_codes, raw_offsets,
-              buffers.array('ends', flat.size, np.int32), buffers.array('end directions', 2 * raw, np.uint8), links)
-    most += parameters.max_gap * raw
+    count, most = raw.closed.size, raw.pixels.size + parameters.max_gap * raw.closed.size
+    links = buffers.array('links', 2 * count, np.int32)
+    link_gaps(flat, stride, count, parameters.max_gap, FAN, FAN_OFFSETS, raw.pixels, raw.codes, raw.offsets,
+              buffers.array('ends', flat.size, np.int32), buffers.array('end directions', 2 * count, np.uint8), links)
     pixels, codes = buffers.array('pixels', most, np.int32), buffers.array('codes', most, np.uint8)
     bridged = buffers.array('bridged', most, np.bool_)
-    offsets, closed = buffers.array('offsets', raw + 1, np.int32), buffers.array('closed', raw, np.bool_)
-    count = assemble(stride, raw, parameters.min_chain, raw_pixels, raw_codes, raw_offsets, links,
-                     buffers.array('done', raw, np.bool_), pixels, codes, bridged, offsets, closed)
-    length = offsets[count]
-    return Chains(pixels[:length], codes[:length], bridged[:length], offsets[:count + 1], closed[:count])
+    offsets, closed = buffers.array('offsets', count + 1, np.int32), buffers.array('closed', count, np.bool_)
+    linked = assemble(stride, count, parameters.min_chain, raw.pixels, raw.codes, raw.offsets, links,
+                      buffers.array('done', count, np.bool_), pixels, codes, bridged, offsets, closed)
+    length = offsets[linked]
+    return Chains(pixels[:length], codes[:length], bridged[:length], offsets[:linked + 1], closed[:linked])
+
+
+def trace_edges(marks: NDArray[np.uint8], parts: int, buffers: Buffers) -> Iterator[Chains]:
+    """Follow the candidates in the marks from strong ones, not over gaps.
+
+    Args:
+        marks: As edge extraction leaves them; pixels that were visited become TAKEN.
+        parts: In so many goes, by the rows that edges are found in.
+        buffers: Memory to work in.
+
+    Yields:
+        The chains that each go added: offsets are those of all chains, into the pixels of all.
+    """
+    flat, (height, stride) = marks.reshape(-1), marks.shape
+    most = int(np.count_nonzero(flat))
+    pixels, codes = buffers.array('raw pixels', most, np.int32), buffers.array('raw codes', most, np.uint8)
+    offsets, stack = buffers.array('raw offsets', most + 1, np.int32), buffers.array('stack', most, np.int32)
+    bridged = buffers.array('not bridged', most, np.bool_, zeros=True)
+    closed = buffers.array('not closed', most, np.bool_, zeros=True)
+    offsets[0] = count = 0
+    for first, end in pairwise(k * height // parts * stride for k in range(parts + 1)):
+        before = count
+        count = trace(first, end, flat, flat.view(np.uint64), stride, NEXT_STATE, _state_steps(stride), pixels, codes,
+                      offsets, before, stack)
+        length = offsets[count]
+        yield Chains(pixels[:length], codes[:length], bridged[:length], offsets[before:count + 1],
+                     closed[:count - before])
+
+
+def joined(parts: list[Chains]) -> Chains:
+    """The chains of all goes of :func:`trace_edges`."""
+    offsets = [part.offsets[:-1] for part in parts]
+    return parts[-1]._replace(offsets=np.concatenate([*offsets, parts[-1].offsets[-1:]]),
+                              closed=np.concatenate([part.closed for part in parts]))
 
 
 def chain_directions(chains: Chains, stride: int) -> NDArray[np.uint8]:
@@ -160,13 +189,17 @@ def chain_directions(chains: Chains, stride: int) -> NDArray[np.uint8]:
 
 @kernel
 def trace(
-    marks: Any, words: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any, offsets: Any, stack: Any,
+    first: int, end: int, marks: Any, words: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any,
+    offsets: Any, chains: int, stack: Any,
 ) -> int:
-    """Visit all candidates that are connected to a strong one; return the number of chains that this made."""
-    chains = 0
-    length = 0
-    offsets[0] = 0
-    for word in range(words.size):
+    """Visit all candidates that are connected to a strong one between two marks; return how many chains there are then.
+
+    Args:
+        first, end: The marks, multiples of eight.
+        chains: How many chains there are before.
+    """
+    length = offsets[chains]
+    for word in range(first // 8, end // 8):
         if words[word] & STRONG_WORD == 0:
             continue
         for seed in range(8 * word, 8 * word + 8):

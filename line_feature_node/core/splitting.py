@@ -52,7 +52,7 @@ def split_chains(
     Returns:
         A blob for each stretch, with the code that most of its pixels have.
     """
-    size = chains.pixels.size
+    size = int(chains.offsets[-1] - chains.offsets[0])
     most = size // min_size + 1
     attributes = buffers.array('stretches', most, BLOB_DTYPE)
     members = buffers.array('members', size, np.int32)
