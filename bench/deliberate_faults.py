@@ -110,7 +110,7 @@ FAULTS = {
         ('shift - turn * middle', 'shift + turn * middle'),
         ('(low, high) if way == 1 else (-high, -low)', '(low, high) if way == 1 else (-low, -high)'),
         ("(0.0 if line['sign'] > 0 else math.pi) - angle", "(0.0 if line['sign'] > 0 else math.pi) + angle"),
-        ('(found - own + SAME_DIRECTION) & DIRECTIONS - 1', 'found - own + SAME_DIRECTION'),
+        ('(np.int64(mark) - direction + SAME_DIRECTION) & DIRECTIONS - 1', 'np.int64(mark) - direction + SAME_DIRECTION'),
         ("-line['sign'] if line['steep'] and not turned", "-line['sign'] if line['steep']"),
         ('math.atan2(cos, -sin)', 'math.atan2(cos, sin)'),
         ('* scale * scale', '* scale'),

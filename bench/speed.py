@@ -138,8 +138,8 @@ def curve_by_edges(reps: int) -> dict[str, list[float]]:
     return rows
 
 
-def contents(width: int, height: int) -> dict[str, Any]:
-    """Pictures of a size that are slow with some detectors."""
+def contents(images: list[Any], width: int, height: int) -> dict[str, Any]:
+    """Pictures of a size that are slow with some detectors; and one that is full of small photographs."""
     rng = np.random.default_rng(0)
     rows, columns = np.indices((height, width), sparse=True)
     lines, text = np.zeros((2, height, width), np.uint8)
@@ -148,7 +148,10 @@ def contents(width: int, height: int) -> dict[str, Any]:
     for y in range(10, height, 12):
         cv2.putText(text, 'Quick brown foxes jump over lazy dogs. ' * (width // 200 + 1), (2, y),
                     cv2.FONT_HERSHEY_PLAIN, 0.8, 255)
-    found = {'black': np.zeros((height, width), np.uint8), 'bright lines on black': lines, 'text': text,
+    small = np.concatenate([fitted(image, 640, 480) for image in images], 1)
+    times = -(-height // small.shape[0]), -(-width // small.shape[1])
+    found = {'photographs side by side': np.ascontiguousarray(np.tile(small, times)[:height, :width]),
+             'black': np.zeros((height, width), np.uint8), 'bright lines on black': lines, 'text': text,
              'checkerboard of 1 px': (255 * ((rows + columns) % 2)).astype(np.uint8),
              'checkerboard of 4 px': (255 * ((rows // 4 + columns // 4) % 2)).astype(np.uint8),
              'stripes of 3 px': np.broadcast_to(255 * (columns // 3 % 2), (height, width)).astype(np.uint8),
@@ -166,7 +169,7 @@ def measure_contents(images: list[Any], reps: int) -> dict[str, dict[str, float]
         few = max(2, min(reps, reps * 640 * 480 // (width * height)))
         photographs = [best_of(extractor.extract, fitted(image, width, height), few) for image in images]
         result[f'{width}×{height}'] = {'photograph': float(np.median(photographs))} | {
-            name: best_of(extractor.extract, image, few) for name, image in contents(width, height).items()}
+            name: best_of(extractor.extract, image, few) for name, image in contents(images, width, height).items()}
     return result
 
 

@@ -643,6 +643,21 @@ def test_norms_are_counted_from_the_top() -> None:
     gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
     counts = np.ones(NORM_BINS, np.int64)
     count_norms(gradient, 2, 36, 46, counts)
-    norms = np.hypot(*np.moveaxis(gradient[2:38:COUNT_ROWS, 2:48:COUNT_COLUMNS], 2, 0))
+    rows = [COUNT_ROWS * k + 5 * k % COUNT_ROWS for k in range(5)]  # at another place among COUNT_ROWS each time
+    assert rows == [0, 13, 18, 31, 36]
+    norms = np.concatenate([np.hypot(*gradient[row + 2, 2 + k % COUNT_COLUMNS:48:COUNT_COLUMNS].T)
+                            for k, row in enumerate(rows) if row < 36])
     assert counts[0] == norms.size
     assert counts.tolist() == [np.count_nonzero(norms >= NORM_BIN * k) for k in range(NORM_BINS)]
+
+
+@pytest.mark.parametrize('period', [3, 4, 5, 8])
+@pytest.mark.parametrize('turned', [False, True])
+def test_edges_side_by_side_are_each_found_once(period: int, turned: bool) -> None:
+    """In stripes of a few pixels what one edge claims must not keep its neighbours from being claimed."""
+    image = np.broadcast_to(np.where(np.arange(160) // period % 2, 200, 50), (900, 160)).astype(np.uint8)
+    found = extract(np.ascontiguousarray(image.T) if turned else image)
+    x = np.sort(found['y' if turned else 'x'])
+    assert len(found) >= 160 // period - 2
+    assert (np.diff(x) > period - 0.5).all()
+    assert (found['length'] > 890).all()

@@ -101,6 +101,8 @@ LEAST_VARIANCE = 0.02**2
 #: Norms are counted in every so many rows and columns, fewer where more than so many of each would be, in bins of so
 #: many units of the gradient.
 COUNT_ROWS, COUNT_COLUMNS, MOST_ROWS, MOST_COLUMNS, NORM_BINS, NORM_BIN = 8, 2, 60, 320, 4096, 4
+#: From one row where norms are counted to the next the place among so many rows moves by this.
+SCATTER = 5
 #: No gradient is rarer than this share of the pixels, as so many are looked at.
 RAREST = 1e-4
 
@@ -186,8 +188,10 @@ def refine_lines(
 
     guesses = grown
 
+    size = 2 * -(-height // CELL) * -(-width // CELL)
+
     def grow_some(some: NDArray[np.int64], memory: Buffers) -> None:
-        claims = memory.array('claims', height * width, np.uint8)[:-(-height // CELL) * -(-width // CELL)]
+        claims = memory.array('claims', size, np.uint8)[:size]
         values = memory.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
         grow(some, guesses, counts, least, flat, stride, pad, height, width, noise, claims, values, grown)
 
@@ -630,17 +634,24 @@ def claimed(line: Any, claims: Any, height: int, width: int) -> float:
     hits, count = 0, 0
     for p in range(low, high + 1, CELL):
         r = min(max(math.floor(slope * p + intercept + HALF), 0), size_q - 1)
-        found = np.int64(claims[np.uint64(p // CELL * step_p + r // CELL * step_q)])
-        turned = (found - own + SAME_DIRECTION) & DIRECTIONS - 1
-        hits += (found >= IS_CLAIMED) & (turned <= 2 * SAME_DIRECTION)
+        cell = np.uint64(p // CELL * step_p + r // CELL * step_q)
+        hits += is_along(claims[cell], own) | is_along(claims[cell + np.uint64(1)], own)
         count += 1
     return hits / max(count, 1)
 
 
+@inlined
+def is_along(mark: Any, direction: int) -> bool:
+    """Whether a claim is there, of a line whose direction is about the same."""
+    turned = (np.int64(mark) - direction + SAME_DIRECTION) & DIRECTIONS - 1
+    return (mark >= IS_CLAIMED) & (turned <= 2 * SAME_DIRECTION)
+
+
 @kernel
 def claim(line: Any, claims: Any, height: int, width: int) -> None:
-    """Claim the cells near a line that nobody has claimed."""
-    mark = np.uint8(direction_of(line) | IS_CLAIMED)
+    """Claim the cells near a line that nobody has claimed who runs in directions of the same half of the circle."""
+    own = direction_of(line)
+    mark, half = np.uint8(own | IS_CLAIMED), own // (DIRECTIONS // 2)
     slope, intercept = line['slope'], line['intercept']
     step_p, step_q, size_p, size_q = cells(line['steep'], height, width)
     reach = CLAIM * math.sqrt(1 + slope * slope)
@@ -648,17 +659,21 @@ def claim(line: Any, claims: Any, height: int, width: int) -> None:
     for cell in range(low // CELL, high // CELL + (high >= low)):
         q = slope * (CELL * cell + HALF) + intercept
         for r in range(max(math.ceil(q - reach), 0) // CELL, min(math.floor(q + reach), size_q - 1) // CELL + 1):
-            index = np.uint64(cell * step_p + r * step_q)
+            index = np.uint64(cell * step_p + r * step_q + half)
             claims[index] = claims[index] or mark
 
 
 @inlined
 def cells(steep: bool, height: int, width: int) -> tuple[int, int, int, int]:
-    """What a cell along p and along q adds to an index of the claims; steps of p and of q that the picture has."""
-    stride = (width + CELL - 1) // CELL
+    """What a cell along p and along q adds to an index of the claims; steps of p and of q that the picture has.
+
+    A cell has two claims, of directions of one half of the circle and of the other: edges as near to each other as the
+    two sides of a thin line have opposite directions.
+    """
+    stride = 2 * ((width + CELL - 1) // CELL)
     if steep:
-        return stride, 1, height, width
-    return 1, stride, width, height
+        return stride, 2, height, width
+    return 2, stride, width, height
 
 
 # Judging
@@ -687,10 +702,13 @@ def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -
     """Count how many of the pixels that are looked at have a norm of each bin, or a larger one."""
     for k in range(counts.size):
         counts[k] = 0
-    rows, turns = max(height // MOST_ROWS, COUNT_ROWS), max(width // (COUNT_COLUMNS * MOST_COLUMNS), 1)
-    for row in range(0, height, rows):
-        # Rows take turns at the columns, or a pattern that repeats would be seen at one place of it only.
-        for column in range(COUNT_COLUMNS * (row // rows % turns), width, COUNT_COLUMNS * turns):
+    every, turns = max(height // MOST_ROWS, COUNT_ROWS), max(width // MOST_COLUMNS, COUNT_COLUMNS)
+    for k in range((height + every - 1) // every):
+        # At another place each time: of a pattern that repeats all is to be seen.
+        row = every * k + SCATTER * k % every
+        if row >= height:
+            continue
+        for column in range(k % turns, width, turns):
             x, y = gradient[row + pad, column + pad, 0], gradient[row + pad, column + pad, 1]
             counts[norm_bin(math.sqrt(np.float32(x) * x + np.float32(y) * y))] += 1
     for k in range(counts.size - 2, -1, -1):
