@@ -17,7 +17,18 @@ import pytest
 from test_pipeline import half_plane, scene
 
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, end_points, extract
-from line_feature_node.core.refinement import COUNT_COLUMNS, COUNT_ROWS, NORM_BIN, NORM_BINS, count_norms, within
+from line_feature_node.core.refinement import (
+    COUNT_COLUMNS,
+    COUNT_ROWS,
+    NORM_BIN,
+    NORM_BINS,
+    RIDGE_DTYPE,
+    claim,
+    claimed,
+    count_norms,
+    leave,
+    within,
+)
 
 Image = npt.NDArray[Any]
 Segments = npt.NDArray[np.void]
@@ -661,3 +672,40 @@ def test_edges_side_by_side_are_each_found_once(period: int, turned: bool) -> No
     assert len(found) >= 160 // period - 2
     assert (np.diff(x) > period - 0.5).all()
     assert (found['length'] > 890).all()
+
+
+def ridge(first: float, last: float, sign: float = 1.0, steep: bool = False, intercept: float = 30.0) -> Any:
+    """A line along an axis of a picture."""
+    lines = np.zeros(1, RIDGE_DTYPE)
+    lines['steep'], lines['intercept'], lines['sign'] = steep, intercept, sign
+    lines['first'], lines['last'] = first, last
+    lines['begin'], lines['end'] = first, last
+    return lines[0]
+
+
+@pytest.mark.parametrize('steep', [False, True])
+@pytest.mark.parametrize(('ends', 'kept', 'share'), [
+    ((20, 120), (50, 120), 0), ((0, 40), (0, 10), 0), ((60, 120), (60, 120), 0), ((51, 90), (51, 90), 0.05),
+    ((0, 100), (0, 100), 0.41), ((20, 40), None, 1)])
+def test_a_line_leaves_its_ends_to_those_who_claim_them(
+    ends: tuple[float, float], kept: tuple[float, float] | None, share: float, steep: bool,
+) -> None:
+    """Not what is claimed in its middle, nor a few pixels where it meets another."""
+    claims = np.zeros(2 * 100 * 100, np.uint8)
+    claim(ridge(10, 50, steep=steep), claims, 200, 200)
+    line = ridge(*ends, steep=steep)
+    assert leave(line, claims, 200, 200) == pytest.approx(share, abs=0.03)
+    if kept is not None:
+        assert (line['begin'], line['end']) == pytest.approx(kept, abs=2.5)
+    other = ridge(*ends, -1.0, steep)
+    assert leave(other, claims, 200, 200) == 0
+    assert (other['begin'], other['end']) == ends
+
+
+def test_claims_of_both_sides_of_a_thin_line_stand_beside_each_other() -> None:
+    """Whichever comes first: the second one is claimed for those who come then, too."""
+    claims = np.zeros(2 * 50 * 50, np.uint8)
+    for sign in (1.0, -1.0):
+        assert claimed(ridge(10, 90, sign), claims, 100, 100) == 0
+        claim(ridge(10, 90, sign), claims, 100, 100)
+        assert claimed(ridge(10, 90, sign), claims, 100, 100) == 1

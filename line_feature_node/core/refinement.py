@@ -28,6 +28,7 @@ RIDGE_DTYPE = np.dtype([
     ('steep', np.bool_),                                # whether p is y
     ('slope', np.float64), ('intercept', np.float64),
     ('first', np.float64), ('last', np.float64),        # its ends, p
+    ('begin', np.float64), ('end', np.float64),         # the ends of what no other line claims of it, p
     ('sign', np.float64),                               # 1 where the gradient points to larger q, else -1
     ('response', np.float64),                           # mean gradient across it
     ('variance', np.float64),                           # of the peaks of the gradient around it, q
@@ -76,11 +77,14 @@ SHORTEST, SHORTEST_GROWING = 9.0, 4.0
 #: A first guess grows when it has this part of what is asked of a line in the end, and what has grown is aligned to
 #: peaks when it has this.
 HOPE, GROWN = 0.45, 0.85
-#: Claims are kept in cells of so many pixels squared. A line claims those within this distance, in pixels; a line of
-#: which more than this part is claimed is dropped.
-CELL, CLAIM, CLAIMED = 2, 2.0, 0.6
+#: Claims are kept in cells of so many pixels squared. A line claims those within this distance, in pixels. A first
+#: guess of which more than the one part is claimed does not grow, and what has grown is dropped where more than the
+#: other part is claimed of what it leaves no other line.
+CELL, CLAIM, CLAIMED, REST_CLAIMED = 2, 2.0, 0.6, 0.75
 #: In place of its size: it is not known yet what a line grows to.
 PENDING = -1
+#: What is claimed of a line at an end is left to others where it is so long, in steps of p.
+LEFT = 4
 #: Between the centres of two pixels.
 HALF = 0.5
 #: Single precision is enough for what is seen of the gradient, and for sums along a line; with double precision most of
@@ -558,7 +562,7 @@ def grow(
             grown[k] = guess
             grow_guess(line, counts, GROWN * least[0], GROWN * least[1], gradient, stride, pad, height, width, noise,
                        values)
-        if line['size'] > 0 and claimed(line, claims, height, width) <= CLAIMED:
+        if line['size'] > 0 and leave(line, claims, height, width) <= REST_CLAIMED:
             line['alive'] = True
             claim(line, claims, height, width)
 
@@ -633,11 +637,49 @@ def claimed(line: Any, claims: Any, height: int, width: int) -> float:
     low, high = within(slope, intercept, line['first'], line['last'], HALF, size_p, size_q)
     hits, count = 0, 0
     for p in range(low, high + 1, CELL):
-        r = min(max(math.floor(slope * p + intercept + HALF), 0), size_q - 1)
-        cell = np.uint64(p // CELL * step_p + r // CELL * step_q)
-        hits += is_along(claims[cell], own) | is_along(claims[cell + np.uint64(1)], own)
+        hits += is_claimed(p, slope * p + intercept, own, claims, step_p, step_q, size_q)
         count += 1
     return hits / max(count, 1)
+
+
+@kernel
+def leave(line: Any, claims: Any, height: int, width: int) -> float:
+    """Leave what others claim at the ends of a line to them; return which share of the rest they claim, too."""
+    own = direction_of(line)
+    slope, intercept = line['slope'], line['intercept']
+    step_p, step_q, size_p, size_q = cells(line['steep'], height, width)
+    low, high = within(slope, intercept, line['first'], line['last'], HALF, size_p, size_q)
+    # Cells in all, of those the claimed ones, and of these such as follow the first end or precede the last.
+    count, hits, at_first, at_last = 0, 0, 0, 0
+    for p in range(low, high + 1, CELL):
+        if is_claimed(p, slope * p + intercept, own, claims, step_p, step_q, size_q):
+            hits += 1
+            at_last += 1
+            at_first += hits > count
+        else:
+            at_last = 0
+        count += 1
+    line['begin'], line['end'] = line['first'], line['last']
+    if hits == count:
+        return 1.0
+    rest, rest_hits = count, hits
+    if CELL * at_first >= LEFT:
+        line['begin'] = low + CELL * at_first - CLAIM
+        rest, rest_hits = rest - at_first, rest_hits - at_first
+    if CELL * at_last >= LEFT:
+        line['end'] = low + CELL * (count - at_last - 1) + CLAIM
+        rest, rest_hits = rest - at_last, rest_hits - at_last
+    return rest_hits / rest
+
+
+@inlined
+def is_claimed(
+    p: int, q: float, direction: int, claims: Any, step_p: int, step_q: int, size_q: int,
+) -> bool:
+    """Whether a place is in a cell of a line of about the same direction."""
+    r = min(max(math.floor(q + HALF), 0), size_q - 1)
+    cell = np.uint64(p // CELL * step_p + r // CELL * step_q)
+    return is_along(claims[cell], direction) | is_along(claims[cell + np.uint64(1)], direction)
 
 
 @inlined
@@ -655,7 +697,7 @@ def claim(line: Any, claims: Any, height: int, width: int) -> None:
     slope, intercept = line['slope'], line['intercept']
     step_p, step_q, size_p, size_q = cells(line['steep'], height, width)
     reach = CLAIM * math.sqrt(1 + slope * slope)
-    low, high = within(slope, intercept, line['first'], line['last'], reach, size_p, size_q)
+    low, high = within(slope, intercept, line['begin'], line['end'], reach, size_p, size_q)
     for cell in range(low // CELL, high // CELL + (high >= low)):
         q = slope * (CELL * cell + HALF) + intercept
         for r in range(max(math.ceil(q - reach), 0) // CELL, min(math.floor(q + reach), size_q - 1) // CELL + 1):
@@ -741,6 +783,7 @@ def judge(least: tuple[float, float], counts: Any, order: Any, grown: Any) -> in
     for k in order:
         line = grown[k]
         if line['alive']:
+            line['first'], line['last'] = line['begin'], line['end']
             line['alive'] = length_of(line) >= SHORTEST and is_clear(line, counts, least[0], least[1])
             left += line['alive']
     return left
@@ -758,7 +801,7 @@ def write(
             continue
         segment = segments[count]
         count += 1
-        slope, first, last = line['slope'], line['first'], line['last']
+        slope, first, last = line['slope'], line['begin'], line['end']
         scale = 1 / math.sqrt(1 + slope * slope)
         q1, q2 = slope * first + line['intercept'], slope * last + line['intercept']
         if line['steep']:
