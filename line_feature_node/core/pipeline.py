@@ -128,7 +128,8 @@ class LineFeatureExtractor:
 
     Attributes:
         parameters: What the next frame is extracted with; may be replaced between two frames.
-        times: Seconds that each of STEPS took in the last frame that was extracted.
+        times: Seconds that each of STEPS took in the last frame that was extracted. What several threads do of it at
+            the same time, scanning to features, counts as scanning.
         unlinked: How many segments the last frame had before linking.
     """
 

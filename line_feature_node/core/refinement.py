@@ -4,8 +4,9 @@ The line of a line-blob is a first guess. Each is aligned with the gradient itse
 the gradient across it peaks. Then it grows at both ends while the gradient goes on, aligned anew as it gets longer, so
 that it crosses the gaps that noise or a weak stretch made in its chain. The ends are where the gradient falls to half,
 as the smoothed gradient does at the end of an edge. Lines are taken in the order of their strength, and each claims the
-pixels along itself: a later one that runs mostly over claimed pixels in the same direction is the same edge found
-twice. What is left must be stronger than noise makes it, and than the texture of the picture does by chance.
+pixels along itself: a later one leaves its ends to those who claim them in the same direction, and one that runs mostly
+over claimed pixels is the same edge found twice. What is left must be stronger than noise makes it, and than texture of
+the picture does by chance.
 
 A line here is q = slope p + intercept, where p is the axis that it follows more closely, the major one: x for flat
 lines, y for steep ones. All along it is looked at in whole steps of p.
@@ -160,6 +161,17 @@ def first_guesses(lines: NDArray[np.void], count: int, ridges: Ridges, buffers: 
     return guesses
 
 
+def joined_guesses(parts: list[Guesses], buffers: Buffers) -> Guesses:
+    """Those of all parts, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    strengths = np.concatenate([part.strengths for part in parts])
+    ridges = buffers.array('ridges', strengths.size, RIDGE_DTYPE)[:strengths.size]
+    # Records would be copied field by field.
+    np.concatenate([part.ridges.view(np.uint8) for part in parts], out=ridges.view(np.uint8))
+    return Guesses(ridges, strengths)
+
+
 def refine_lines(
     parts: list[Guesses], ridges: Ridges, parameters: Parameters, buffers: Buffers, team: Team,
 ) -> NDArray[np.void]:
@@ -177,25 +189,17 @@ def refine_lines(
     """
     gradient, pad, height, width, noise, step, correlation = ridges
     flat, stride = gradient.reshape(-1), 2 * gradient.shape[1]
-    grown, strengths = parts[0]
-    if len(parts) > 1:
-        strengths = np.concatenate([part.strengths for part in parts])
-        grown = buffers.array('ridges', strengths.size, RIDGE_DTYPE)[:strengths.size]
-        # Records would be copied field by field.
-        np.concatenate([part.ridges.view(np.uint8) for part in parts], out=grown.view(np.uint8))
+    grown, strengths = joined_guesses(parts, buffers)
     # The first bits of floats are in their order, and sorted faster, by counting.
     order = np.argsort(~(strengths.view(np.uint32) >> 16).astype(np.uint16), kind='stable')
     counts = buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS]
     count_norms(gradient, pad, height, width, counts)
     tests = 2 * math.log10(height * width)
     least = parameters.min_snr * noise, tests - math.log10(parameters.false_alarms)
-
-    guesses = grown
-
-    size = 2 * -(-height // CELL) * -(-width // CELL)
+    guesses, cells_twice = grown, 2 * -(-height // CELL) * -(-width // CELL)
 
     def grow_some(some: NDArray[np.int64], memory: Buffers) -> None:
-        claims = memory.array('claims', size, np.uint8)[:size]
+        claims = memory.array('claims', cells_twice, np.uint8)[:cells_twice]
         values = memory.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
         grow(some, guesses, counts, least, flat, stride, pad, height, width, noise, claims, values, grown)
 
