@@ -408,26 +408,35 @@ def soak(folder: Path, options: argparse.Namespace) -> list[Row]:
 
 
 def draw(samples: list[Row], path: Path) -> None:
-    """Memory and latency over time; where matplotlib is missing, say so."""
+    """Memory and latency over time."""
+    draw_panels(samples, [
+        ('memory of the node', 'MiB', {'resident': 'resident', 'own': 'its own, without shared memory'}),
+        (f'latency, {CASES[-1].name}', 'ms', {'p99': 'p99 of a second', 'p50': 'p50 of a second'}),
+    ], path)
+
+
+def draw_panels(samples: list[Row], panels: list[tuple[str, str, dict[str, str]]], path: Path) -> None:
+    """Draw curves over time; where matplotlib is missing, say so.
+
+    Args:
+        samples: What was measured, each with its `time`.
+        panels: Of each title, unit, and the names in the samples with what they are called.
+        path: The picture.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        print(f'the curve is not drawn, as matplotlib is not installed: where it is, --draw {path.parent} draws it')
+        print(f'the curves are not drawn, as matplotlib is not installed: where it is, --draw {path.parent} draws them')
         return
-    figure = Figure((11, 4.2), layout='constrained')
+    figure = Figure((5.2 * len(panels), 4.2), layout='constrained')
     times = [row['time'] for row in samples]
-    memory, latency = figure.subplots(1, 2)
-    memory.plot(times, [row['resident'] for row in samples], label='resident')
-    memory.plot(times, [row['own'] for row in samples], label='its own, without shared memory')
-    memory.set(xlabel='s', ylabel='MiB', title='memory of the node', ylim=(0, None))
-    for name in ('p99', 'p50'):
-        values = [np.nan if row[name] is None else row[name] for row in samples]
-        latency.plot(times, values, label=f'{name} of a second')
-    latency.set(xlabel='s', ylabel='ms', title=f'latency, {CASES[-1].name}', ylim=(0, None))
-    for axes in (memory, latency):
+    for axes, (title, unit, names) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        for name, label in names.items():
+            axes.plot(times, [np.nan if row[name] is None else row[name] for row in samples], label=label)
+        axes.set(xlabel='s', ylabel=unit, title=title, ylim=(0, None))
         axes.legend()
     figure.savefig(path, dpi=110)
-    print(f'curve: {path}')
+    print(f'curves: {path}')
 
 
 def render(folder: Path, cases: list[Case]) -> None:

@@ -35,7 +35,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from node import PROFILE, Case, Row, Watched, environment, render
+from node import PROFILE, Case, Row, Watched, draw_panels, environment, render
 
 if '--draw' not in sys.argv:
     import rclpy
@@ -499,30 +499,12 @@ def seconds(result: Row) -> list[Row]:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Memory, handles and latency over time; where matplotlib is missing, say so."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        print(f'the curves are not drawn, as matplotlib is not installed: where it is, --draw {path.parent} draws them')
-        return
-    figure = Figure((15, 4.2), layout='constrained')
-    times = [row['time'] for row in rows]
-    memory, handles, latency = figure.subplots(1, 3)
-    memory.plot(times, [row['resident'] for row in rows], label='resident, with what is shared')
-    memory.plot(times, [row['own'] for row in rows], label='its own')
-    memory.set(ylabel='MiB', title='memory of the node')
-    for name in ('threads', 'descriptors'):
-        handles.plot(times, [row[name] for row in rows], label=name)
-    handles.set(title='threads and descriptors of the node')
-    for name in ('p99', 'p50'):
-        values = [np.nan if row[name] is None else row[name] for row in rows]
-        latency.plot(times, values, label=f'{name} of a second')
-    latency.set(ylabel='ms', title='latency')
-    for axes in (memory, handles, latency):
-        axes.set(xlabel='s', ylim=(0, None))
-        axes.legend()
-    figure.savefig(path, dpi=110)
-    print(f'curves: {path}')
+    """Memory, handles and latency over time."""
+    draw_panels(rows, [
+        ('memory of the node', 'MiB', {'resident': 'resident, with what is shared', 'own': 'its own'}),
+        ('threads and descriptors of the node', '', {'threads': 'threads', 'descriptors': 'descriptors'}),
+        ('latency', 'ms', {'p99': 'p99 of a second', 'p50': 'p50 of a second'}),
+    ], path)
 
 
 def run(options: argparse.Namespace) -> int:
