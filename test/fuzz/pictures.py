@@ -3,6 +3,7 @@
 import array
 import contextlib
 import ctypes
+import dataclasses
 import math
 import mmap
 import struct
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 from mutations import edge, mutated
 
-from line_feature_node.core import PROFILES, SEGMENT_DTYPE, LineFeatureExtractor, Parameters
+from line_feature_node.core import PROFILES, SEGMENT_DTYPE, LineFeatureExtractor, Parameters, pipeline
 from line_feature_node.core.pipeline import PIXEL_TYPES
 from line_feature_node.images import (
     ENCODINGS,
@@ -36,6 +37,10 @@ BUFFERS = (bytes, bytearray, memoryview, lambda data: array.array('B', data),
 #: Numbers that floats go wrong with.
 ODD = (math.nan, math.inf, -math.inf, 0.0, -0.0, 5e-324, 1e-45, 1e-38, 3.4e38, -3.4e38, 1e308, 255.0, 2.0**24)
 WORKING = LineFeatureExtractor()
+#: Small pictures are shared among threads, too: large ones would take too long.
+pipeline.LEAST_SHARED = 0
+#: How many threads; each other number makes as many anew.
+THREADS = (1, 1, 1, 2, 2, 3, 7)
 
 Input = dict[str, Any]
 
@@ -211,7 +216,7 @@ def extractor_input(draw: Random) -> Input:
     with np.errstate(all='ignore'):  # numbers that a type cannot have are wanted
         image = _image(draw)
     return {'image': image, 'mask': _mask(draw, image), 'profile': draw.choice([*PROFILES, 'default', 'default']),
-            'parameters': parameters(draw), 'fresh': draw.random() < 0.02}
+            'parameters': parameters(draw), 'fresh': draw.random() < 0.05}
 
 
 def _image(draw: Random) -> Any:
@@ -321,6 +326,8 @@ def parameters(draw: Random) -> Input:
 def _value(draw: Random, name: str) -> Any:
     """A value within its range, at its ends now and then."""
     spec, default = Parameters.specs()[name], getattr(Parameters(), name)
+    if name == 'threads':
+        return draw.choice(THREADS)
     if isinstance(default, tuple):
         share = [draw.choice((0.0, 0.3, 0.5, draw.random())) for _ in range(2)]
         if draw.random() < 0.3:
@@ -354,6 +361,7 @@ def check_extractor(fields: Input) -> int:
     assert before is not None
     assert before.tobytes() == image.tobytes(), 'the image was changed'
     if fields['fresh']:
-        fresh = LineFeatureExtractor(WORKING.parameters).extract(image, mask)
-        assert fresh.tobytes() == segments.tobytes(), 'what came before tells on the result'
+        alone = dataclasses.replace(WORKING.parameters, threads=1)
+        fresh = LineFeatureExtractor(alone).extract(image, mask)
+        assert fresh.tobytes() == segments.tobytes(), 'what came before, or the threads, tell on the result'
     return int(image.nbytes)
