@@ -113,7 +113,8 @@ FAULTS = {
         ('direction + SAME_DIRECTION) & DIRECTIONS - 1', 'direction + SAME_DIRECTION)'),
         ('low + CELL * at_first - CLAIM', 'low + CELL * at_first + CLAIM'),
         ('at_first += hits > count', 'at_first += hits >= count'),
-        ('r * step_q + half', 'r * step_q'),
+        ('if not is_along(claims[index], own):', 'if True:'),
+        ("line['begin'] > line['first'] or line['end']", "line['begin'] < line['first'] or line['end']"),
         ("-line['sign'] if line['steep'] and not turned", "-line['sign'] if line['steep']"),
         ('math.atan2(cos, -sin)', 'math.atan2(cos, sin)'),
         ('* scale * scale', '* scale'),
@@ -151,7 +152,7 @@ FAULTS = {
     'team': [
         ('[results[number] for number in range(len(results))]', 'list(results.values())'),
         ('tools[thread:thread + 1]', 'tools[0:1]'),
-        ('own[number] if number in own else helper.result()', 'helper.result()'),
+        ('if not all(helper.done() for helper in helpers):', 'if False:'),
         ('if first < end]', 'if first <= end]'),
         ('not all(thread.is_alive() for thread in self._threads)', 'False'),
     ],

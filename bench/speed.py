@@ -154,7 +154,8 @@ def contents(images: list[Any], width: int, height: int) -> dict[str, Any]:
              'black': np.zeros((height, width), np.uint8), 'bright lines on black': lines, 'text': text,
              'checkerboard of 1 px': (255 * ((rows + columns) % 2)).astype(np.uint8),
              'checkerboard of 4 px': (255 * ((rows // 4 + columns // 4) % 2)).astype(np.uint8),
-             'stripes of 3 px': np.broadcast_to(255 * (columns // 3 % 2), (height, width)).astype(np.uint8),
+             'stripes of 3 px': np.ascontiguousarray(
+                 np.broadcast_to(255 * (columns // 3 % 2), (height, width)), np.uint8),
              'black and white at random': (255 * rng.integers(0, 2, (height, width), np.uint8))}
     noise = rng.standard_normal((height, width), np.float32)
     return found | {f'noise of {sigma} grey levels': np.clip(noise * sigma + 128, 0, 255).astype(np.uint8)

@@ -352,6 +352,7 @@ class _Work:
         files = [source] if source.is_file() else sorted(source.iterdir())
         mask = self._run.job.mask
         job = {**asdict(self._run.job), 'mask': '' if mask is None else hashlib.sha256(mask.tobytes()).hexdigest()}
+        del job['parameters']['threads']
         return {'version': importlib.metadata.version('line_feature_node'), 'job': job,
                 'files': [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files],
                 'slices': [asdict(replace(part, path=Path())) for part in self._slices]}

@@ -75,7 +75,7 @@ def bag(
     try:
         pairs = list(_targets(recordings, find_recordings(recordings), out))
         # Where several frames are worked on at the same time, threads on each would only stand in line.
-        job = Job(parameters if workers == 1 else dataclasses.replace(parameters, threads=1),
+        job = Job(parameters if workers == 1 and not scheduler else dataclasses.replace(parameters, threads=1),
                   _mask(mask_file, options), outputs=('segments',) if only_segments else tuple(OUTPUTS),
                   truth=truth, csv=csv, jpeg_quality=options.jpeg_quality)
         run = Run(job, tuple(topic or ()), start, end, every, storage, copy=copy, overwrite=overwrite, resume=resume)

@@ -24,6 +24,10 @@ PNG, PNG_END = b'\x89PNG', b'IEND'
 PNG_CHUNK = 12
 #: Markers of a JPEG that announce its size: all of SOF0 to SOF15 but the tables DHT, JPG and DAC among them.
 JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+#: 8×8 pixels of a JPEG take a bit at least, and a byte of what deflate makes stands for so many at most.
+JPEG_PIXELS, INFLATED = 8 * 64, 1032
+#: Where the colour type of a PNG stands, behind the bits of a sample; and how many samples a pixel has, by the type.
+PNG_TYPE, PNG_SAMPLES = 25, {2: 3, 4: 2, 6: 4}
 #: Bytes before the picture in a compressed depth image: format, and two numbers that map inverse depth to 16 bits.
 DEPTH_HEADER = struct.Struct('<iff')
 
@@ -177,6 +181,8 @@ def decode(data: bytes, *, grey: bool = False) -> NDArray[Any]:
         raise ValueError(f'not an image: {len(data)} bytes of {kind} without a size')
     if width * height > MOST_PIXELS:
         raise ValueError(f'an image of {width}×{height} pixels: expected {MOST_PIXELS} at most')
+    if width * height > (most := _most_pixels(data)):
+        raise ValueError(f'an image of {width}×{height} pixels in {len(data)} bytes, which hold {most} pixels at most')
     channels = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), channels | cv2.IMREAD_ANYDEPTH)
@@ -215,6 +221,15 @@ def _announced_size(data: bytes) -> tuple[int, int]:
         width, height = struct.unpack_from('>II', data, 16)
         return width, height
     return 0, 0
+
+
+def _most_pixels(data: bytes) -> int:
+    """How many pixels a JPEG or PNG of so many bytes has at most, so that none is given room that it cannot fill."""
+    if data.startswith(JPEG):
+        return JPEG_PIXELS * len(data)
+    if data.startswith(PNG) and len(data) > PNG_TYPE:
+        return INFLATED * 8 * len(data) // (max(data[PNG_TYPE - 1], 1) * PNG_SAMPLES.get(data[PNG_TYPE], 1))
+    return MOST_PIXELS
 
 
 def _jpeg_header(data: bytes) -> tuple[int, tuple[int, int]]:

@@ -2,6 +2,7 @@ import array
 import itertools
 import re
 import struct
+import zlib
 from types import SimpleNamespace
 
 import cv2
@@ -585,3 +586,41 @@ def test_what_is_not_finite_is_shown_without_a_warning():
     signalling = np.array([[0x7f800001, 0x7f7fffff, 0xff800000]], np.uint32).view(np.float32)
     shown = displayable(signalling, Parameters(intensity_min=0.0, intensity_max=1e-3))
     np.testing.assert_array_equal(shown, [[0, 0, 0]])
+
+
+def with_jpeg_size(data: bytes, width: int, height: int) -> bytes:
+    """A JPEG whose header says another size."""
+    frame = re.search(rb'\xff[\xc0\xc2]\x00\x11\x08', data).start()
+    return data[:frame + 5] + struct.pack('>HH', height, width) + data[frame + 9:]
+
+
+@pytest.mark.parametrize('progressive', [0, 1])
+def test_a_small_jpeg_that_claims_many_pixels_is_refused(progressive):
+    """Half a gigabyte would be made room for, and filled with grey."""
+    small = cv2.imencode('.jpg', np.full((64, 64, 3), 90, np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1]
+    data = with_jpeg_size(small.tobytes(), 16000, 12000)
+    with pytest.raises(ValueError, match=f'of 16000×12000 pixels in {len(data)} bytes, which hold {512 * len(data)}'):
+        decode(data)
+
+
+def test_a_small_png_that_claims_many_pixels_is_refused():
+    small = cv2.imencode('.png', np.zeros((64, 64), np.uint16))[1].tobytes()
+    header = struct.pack('>II', 16000, 12000) + small[24:29]
+    data = small[:16] + header + struct.pack('>I', zlib.crc32(b'IHDR' + header)) + small[33:]
+    with pytest.raises(ValueError, match=f'an image of 16000×12000 pixels in {len(data)} bytes, which hold'):
+        decode(data)
+
+
+@pytest.mark.parametrize('shape', [(3000, 4000), (3000, 4000, 3), (4001, 17)])
+@pytest.mark.parametrize('level', [0, 255])
+@pytest.mark.parametrize(('ending', 'options'), [
+    ('.jpg', []), ('.png', [cv2.IMWRITE_PNG_COMPRESSION, 9]), ('.png', [cv2.IMWRITE_PNG_BILEVEL, 1]),
+    ('.jpg', [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_OPTIMIZE, 1, cv2.IMWRITE_JPEG_QUALITY, 1]),
+])
+def test_pictures_of_one_grey_are_as_small_as_they_get(shape, level, ending, options):
+    """A camera with its cap on: none is taken for one that claims too much."""
+    image = np.full(shape, level, np.uint8)
+    image[-1, -1] = 255 - level
+    if cv2.IMWRITE_PNG_BILEVEL in options:
+        image = np.ascontiguousarray(image.reshape(*shape[:2], -1)[..., 0])
+    np.testing.assert_allclose(decode(cv2.imencode(ending, image, options)[1].tobytes()).shape[:2], shape[:2])

@@ -11,7 +11,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from line_feature_node.core import SEGMENT_DTYPE, STEPS, LineFeatureExtractor, Parameters, Stages, extract, pipeline
+from line_feature_node.core import (
+    SEGMENT_DTYPE,
+    STEPS,
+    LineFeatureExtractor,
+    Parameters,
+    Stages,
+    edges,
+    extract,
+    pipeline,
+)
 from line_feature_node.scenes import Camera, corridor
 
 Image = npt.NDArray[Any]
@@ -531,14 +540,31 @@ def test_threads_make_no_difference(
         np.testing.assert_array_equal(shared.edges(), alone.edges())
 
 
-@pytest.mark.parametrize('kind', [np.uint16, np.float32])
-def test_threads_make_no_difference_to_other_pixels(kind: type) -> None:
-    image = wide(720, 1280, 4, kind)
+@pytest.mark.parametrize('kind', TYPES)
+@pytest.mark.parametrize('roi', [(0.0, 0.0, 1.0, 1.0), (0.0, 0.1, 0.95, 0.85)])
+def test_threads_make_no_difference_to_masks_and_regions(kind: type, roi: Any) -> None:
+    image = wide(800, 1280, 4, kind)
     mask = np.ones(image.shape, np.uint8)
     mask[200:300, 400:900] = 0
-    expected = LineFeatureExtractor().extract(image, mask)
+    expected = LineFeatureExtractor(Parameters(roi=roi)).extract(image, mask)
     assert len(expected) > 20
-    assert same(LineFeatureExtractor(Parameters(threads=2)).extract(image, mask), expected)
+    assert same(LineFeatureExtractor(Parameters(roi=roi, threads=2)).extract(image, mask), expected)
+
+
+def test_warm_up_is_for_all_threads() -> None:
+    """No kernel is compiled, or loaded, at the first frame that is large enough for several."""
+    before = signatures()
+    extractor = LineFeatureExtractor(Parameters(threads=2, operator='deriche'))
+    extractor.warm_up(np.uint16)
+    warm = signatures()
+    assert warm['smooth_down'] >= max(before['smooth_down'], 1)
+    extractor.extract(wide(720, 1280, 4, np.uint16))
+    assert signatures() == warm
+
+
+def signatures() -> dict[str, int]:
+    """How many types of arguments each kernel of the edge extraction is compiled for."""
+    return {name: len(value.signatures) for name, value in vars(edges).items() if hasattr(value, 'signatures')}
 
 
 def test_small_pictures_have_one_thread() -> None:

@@ -19,7 +19,6 @@ from test_pipeline import half_plane, scene
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, end_points, extract
 from line_feature_node.core.refinement import (
     COUNT_COLUMNS,
-    COUNT_ROWS,
     NORM_BIN,
     NORM_BINS,
     RIDGE_DTYPE,
@@ -654,8 +653,7 @@ def test_norms_are_counted_from_the_top() -> None:
     gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
     counts = np.ones(NORM_BINS, np.int64)
     count_norms(gradient, 2, 36, 46, counts)
-    rows = [COUNT_ROWS * k + 5 * k % COUNT_ROWS for k in range(5)]  # at another place among COUNT_ROWS each time
-    assert rows == [0, 13, 18, 31, 36]
+    rows = [0, 12, 17, 30, 35]  # one in COUNT_ROWS, at another place among them each time
     norms = np.concatenate([np.hypot(*gradient[row + 2, 2 + k % COUNT_COLUMNS:48:COUNT_COLUMNS].T)
                             for k, row in enumerate(rows) if row < 36])
     assert counts[0] == norms.size
@@ -663,15 +661,42 @@ def test_norms_are_counted_from_the_top() -> None:
 
 
 @pytest.mark.parametrize('period', [3, 4, 5, 8])
+@pytest.mark.parametrize('size', [160, 600, 1200])
 @pytest.mark.parametrize('turned', [False, True])
-def test_edges_side_by_side_are_each_found_once(period: int, turned: bool) -> None:
+def test_edges_side_by_side_are_each_found_once(period: int, size: int, turned: bool) -> None:
     """In stripes of a few pixels what one edge claims must not keep its neighbours from being claimed."""
-    image = np.broadcast_to(np.where(np.arange(160) // period % 2, 200, 50), (900, 160)).astype(np.uint8)
+    image = np.broadcast_to(np.where(np.arange(size) // period % 2, 200, 50), (900, size)).astype(np.uint8)
     found = extract(np.ascontiguousarray(image.T) if turned else image)
     x = np.sort(found['y' if turned else 'x'])
-    assert len(found) >= 160 // period - 2
+    assert len(found) >= size // period - 2
     assert (np.diff(x) > period - 0.5).all()
     assert (found['length'] > 890).all()
+
+
+@pytest.mark.parametrize('degrees', [1.4, 0.7, 20, 44, 46])
+def test_edges_side_by_side_are_each_found_once_at_any_angle(degrees: float) -> None:
+    """Also where the codes of opposite directions are not half of the circle apart."""
+    rows, columns = np.mgrid[:400, :300] * 1.0
+    across = columns * math.cos(math.radians(degrees)) + rows * math.sin(math.radians(degrees))
+    found = extract((125 + 75 * np.clip(3 * np.sin(across * math.pi / 4), -1, 1)).astype(np.uint8))
+    offsets = np.sort(found['x'] * math.cos(math.radians(degrees)) + found['y'] * math.sin(math.radians(degrees)))
+    assert len(found) > 50
+    assert (np.diff(offsets) > 3).mean() > 0.97
+    assert found['length'].sum() < 1.1 * 400 * 300 / 4
+
+
+def test_a_line_that_is_cut_is_told_of_by_the_rest() -> None:
+    """A weak edge that goes on as a strong one, at a slightly different angle, does not get its contrast."""
+    rows, columns = np.mgrid[:200, :400]
+    step = np.where(columns < 120, 12, 100)
+    bend = np.where(columns < 120, 0, 0.03 * (columns - 120))
+    image = (60 + step * np.clip(rows - 100 - bend + 0.5, 0, 1)).astype(np.uint8)
+    found = extract(image)
+    weak = found[(found['x'] < 115) & (abs(found['theta']) < 0.1)]
+    assert len(weak) == 1
+    assert weak['contrast'][0] == pytest.approx(12, abs=6)
+    assert weak['size'][0] <= weak['length'][0] + 2
+    assert found['contrast'].max() == pytest.approx(100, rel=0.1)
 
 
 def ridge(first: float, last: float, sign: float = 1.0, steep: bool = False, intercept: float = 30.0) -> Any:

@@ -2,6 +2,9 @@
 
 import gc
 import multiprocessing
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -145,17 +148,76 @@ def test_threads_end_with_their_team() -> None:
 
 
 def _in_child(team: Team, answers: Any) -> None:
-    answers.put(team.each(abs, [(-k,) for k in range(4)]))
+    barrier = threading.Barrier(2)
+    answers.put(len(set(team.each(lambda: (barrier.wait(10), threading.get_ident())[1], [(), ()]))))
 
 
 @pytest.mark.filterwarnings('ignore:.*fork:DeprecationWarning')
 def test_a_forked_process_has_threads_of_its_own() -> None:
-    """Those of its parent do not exist in it, and it would wait for them for ever."""
+    """Those of its parent do not exist in it; it would work alone."""
     team, context = Team(2), multiprocessing.get_context('fork')
     assert team.each(abs, [(-1,), (-2,)]) == [1, 2]
     answers = context.Queue()
     child = context.Process(target=_in_child, args=(team, answers))
     child.start()
-    assert answers.get(timeout=20) == [0, 1, 2, 3]
+    assert answers.get(timeout=20) == 2
     child.join(20)
     assert child.exitcode == 0
+
+
+@pytest.mark.parametrize('there', [0, 2])
+def test_where_no_more_threads_start_the_calling_one_works_alone(there: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    start, started = threading.Thread.start, []
+
+    def refuse(thread: threading.Thread) -> None:
+        if len(started) == there:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, 'start', refuse)
+    team = Team(4)
+    for _ in range(2):
+        assert set(team.each(threading.current_thread, [()] * 6)) == {threading.current_thread()}
+        assert team.pipe(abs, ((-k,) for k in range(6))) == [0, 1, 2, 3, 4, 5]
+        started.clear()
+
+
+def test_work_goes_on_when_the_main_thread_has_ended() -> None:
+    """No thread can be asked for help then."""
+    code = """
+import threading, time
+from line_feature_node.core.team import Team
+
+team = Team(2)
+print(team.each(abs, [(-1,), (-2,)]))
+
+def late():
+    threading.main_thread().join()
+    time.sleep(0.2)
+    print(team.each(abs, [(-3,), (-4,)]), team.pipe(abs, [(-5,), (-6,)]))
+
+threading.Thread(target=late).start()
+"""
+    ended = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=60, check=True)
+    assert (ended.stdout, ended.stderr) == ('[1, 2]\n[3, 4] [5, 6]\n', '')
+
+
+@pytest.mark.parametrize('way', ['each', 'pipe'])
+def test_an_interrupt_waits_for_the_others(way: str) -> None:
+    """They write into memory that the next frame uses."""
+    team, began, quiet = Team(2), threading.Event(), threading.Event()
+    main = threading.get_ident()
+
+    def work(_: int) -> None:
+        if threading.get_ident() == main:
+            began.wait(10)
+            return
+        began.set()
+        signal.pthread_kill(main, signal.SIGINT)
+        time.sleep(0.3)
+        quiet.set()
+
+    with pytest.raises(KeyboardInterrupt):
+        getattr(team, way)(work, [(1,), (2,)])
+    assert quiet.is_set()

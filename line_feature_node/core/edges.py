@@ -117,8 +117,7 @@ def smooth_image(
     """
     height, columns = image.shape[0], plane.shape[1]
     last = buffers.array('last row', columns, np.float32)
-    # A low picture is one part.
-    below = (height // LANES // team.size * LANES if team.size > 1 else 0) or height
+    below = height if team.size == 1 else min(max(height // LANES // team.size, 1) * LANES, height)
 
     def smooth_some(first: int, end: int, memory: Buffers) -> None:
         strip = memory.array('strip', columns * LANES, np.float32)

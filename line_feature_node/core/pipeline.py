@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -129,7 +130,7 @@ class LineFeatureExtractor:
     Attributes:
         parameters: What the next frame is extracted with; may be replaced between two frames.
         times: Seconds that each of STEPS took in the last frame that was extracted. What several threads do of it at
-            the same time, scanning to features, counts as scanning.
+            the same time, from scanning to the first look along the lines, counts as scanning.
         unlinked: How many segments the last frame had before linking.
     """
 
@@ -202,7 +203,9 @@ class LineFeatureExtractor:
         for kind in types or PIXEL_TYPES:
             with contextlib.suppress(*() if types else (ValueError,)):
                 copy_of_it = LineFeatureExtractor(dataclasses.replace(self.parameters, roi=(0, 0, 1, 1), scale=1))
-                copy_of_it.extract(np.zeros((16, 16), kind))
+                # Some kernels are for several threads only, which small pictures do not have.
+                size = 16 if self.parameters.threads == 1 else math.isqrt(LEAST_SHARED) + 1
+                copy_of_it.extract(np.zeros((size, size), kind))
 
     def stages(self, image: NDArray[Any], mask: NDArray[Any] | None = None) -> Stages:
         """Extract, and keep what every step made; arguments and errors as for :meth:`extract`."""
@@ -230,7 +233,11 @@ class LineFeatureExtractor:
             self._busy.release()
 
     def _steps(self, image: NDArray[Any], mask: NDArray[Any] | None, watch: Watch) -> NDArray[np.void]:
-        """The steps in their order; `watch` sees the result of each before the next one works on it."""
+        """The steps in their order.
+
+        `watch` sees what each made before the next one works on it; of what several threads do at the same time, all of
+        it when they are done.
+        """
         buffers = self._buffers
         grey, keep, view = working_picture(image, mask, self.parameters, buffers)
         team = self._team_for(grey.size)

@@ -106,8 +106,9 @@ LEAST_VARIANCE = 0.02**2
 #: Norms are counted in every so many rows and columns, fewer where more than so many of each would be, in bins of so
 #: many units of the gradient.
 COUNT_ROWS, COUNT_COLUMNS, MOST_ROWS, MOST_COLUMNS, NORM_BINS, NORM_BIN = 8, 2, 60, 320, 4096, 4
-#: From one row where norms are counted to the next the place among so many rows moves by this.
-SCATTER = 5
+#: From one row where norms are counted to the next the place among so many rows moves by this part of them: the
+#: golden section, so that it is soon everywhere among them.
+SCATTER = (math.sqrt(5) - 1) / 2
 #: No gradient is rarer than this share of the pixels, as so many are looked at.
 RAREST = 1e-4
 
@@ -210,7 +211,7 @@ def refine_lines(
         team.each(grow_some, [(order[(order >= first) & (order < end)],) for first, end in team.shares(grown.size)],
                   buffers.parts(team.size))
     grow_some(order, buffers)
-    kept = judge(least, counts, order, grown)
+    kept = judge(least, counts, order, flat, stride, pad, height, width, grown)
     segments = np.empty(kept, SEGMENT_DTYPE)
     write(order, grown, step, correlation, tests, counts, segments)
     return segments
@@ -695,9 +696,9 @@ def is_along(mark: Any, direction: int) -> bool:
 
 @kernel
 def claim(line: Any, claims: Any, height: int, width: int) -> None:
-    """Claim the cells near a line that nobody has claimed who runs in directions of the same half of the circle."""
+    """Claim the cells near a line that nobody claims in about its direction, where there is room for one more claim."""
     own = direction_of(line)
-    mark, half = np.uint8(own | IS_CLAIMED), own // (DIRECTIONS // 2)
+    mark = np.uint8(own | IS_CLAIMED)
     slope, intercept = line['slope'], line['intercept']
     step_p, step_q, size_p, size_q = cells(line['steep'], height, width)
     reach = CLAIM * math.sqrt(1 + slope * slope)
@@ -705,16 +706,17 @@ def claim(line: Any, claims: Any, height: int, width: int) -> None:
     for cell in range(low // CELL, high // CELL + (high >= low)):
         q = slope * (CELL * cell + HALF) + intercept
         for r in range(max(math.ceil(q - reach), 0) // CELL, min(math.floor(q + reach), size_q - 1) // CELL + 1):
-            index = np.uint64(cell * step_p + r * step_q + half)
-            claims[index] = claims[index] or mark
+            index = np.uint64(cell * step_p + r * step_q)
+            if not is_along(claims[index], own):
+                index += np.uint64(claims[index] != 0)
+                claims[index] = claims[index] or mark
 
 
 @inlined
 def cells(steep: bool, height: int, width: int) -> tuple[int, int, int, int]:
     """What a cell along p and along q adds to an index of the claims; steps of p and of q that the picture has.
 
-    A cell has two claims, of directions of one half of the circle and of the other: edges as near to each other as the
-    two sides of a thin line have opposite directions.
+    A cell has room for two claims: edges as near to each other as the sides of a thin line have opposite directions.
     """
     stride = 2 * ((width + CELL - 1) // CELL)
     if steep:
@@ -751,7 +753,7 @@ def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -
     every, turns = max(height // MOST_ROWS, COUNT_ROWS), max(width // MOST_COLUMNS, COUNT_COLUMNS)
     for k in range((height + every - 1) // every):
         # At another place each time: of a pattern that repeats all is to be seen.
-        row = every * k + SCATTER * k % every
+        row = every * k + int(every * (SCATTER * k % 1))
         if row >= height:
             continue
         for column in range(k % turns, width, turns):
@@ -781,15 +783,25 @@ def is_clear(line: Any, counts: Any, least_strength: float, least_evidence: floa
 
 
 @kernel
-def judge(least: tuple[float, float], counts: Any, order: Any, grown: Any) -> int:
-    """Drop the lines that are too short or not clear enough; return how many are left."""
+def judge(
+    least: tuple[float, float], counts: Any, order: Any, gradient: Any, stride: int, pad: int, height: int, width: int,
+    grown: Any,
+) -> int:
+    """Drop the lines that are too short or not clear enough; return how many are left.
+
+    What a line left to others does not count: it is judged, and told of, by what there is along the rest.
+    """
     left = 0
     for k in order:
         line = grown[k]
-        if line['alive']:
-            line['first'], line['last'] = line['begin'], line['end']
-            line['alive'] = length_of(line) >= SHORTEST and is_clear(line, counts, least[0], least[1])
-            left += line['alive']
+        if not line['alive']:
+            continue
+        if line['begin'] > line['first'] or line['end'] < line['last']:
+            line['first'], line['last'], line['size'] = line['begin'], line['end'], 0
+            in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], pad * (stride + 2), stride, height, width)
+            align_to_peaks(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, 0.0)
+        line['alive'] = line['size'] > 0 and length_of(line) >= SHORTEST and is_clear(line, counts, least[0], least[1])
+        left += line['alive']
     return left
 
 
@@ -805,7 +817,7 @@ def write(
             continue
         segment = segments[count]
         count += 1
-        slope, first, last = line['slope'], line['begin'], line['end']
+        slope, first, last = line['slope'], line['first'], line['last']
         scale = 1 / math.sqrt(1 + slope * slope)
         q1, q2 = slope * first + line['intercept'], slope * last + line['intercept']
         if line['steep']:

@@ -1,9 +1,10 @@
 """Threads that share the work on one frame."""
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -52,8 +53,10 @@ class Team:
                     return
                 results[number] = work(*piece, *tool)
 
-        helpers = [self._pool().submit(help_out, thread) for thread in range(1, min(self.size, len(todo)))]
+        helpers: list[Future[None]] = []
         try:
+            for thread in range(1, min(self.size, len(todo))):
+                helpers += self._begin(help_out, thread)
             help_out(0)
         finally:
             todo.clear()
@@ -78,20 +81,21 @@ class Team:
         if self.size == 1:
             return [work(*piece) for piece in pieces]
         made: list[tuple[Any, ...]] = []
-        helpers: list[Future[T]] = []
+        helpers: dict[int, Future[T]] = {}
         own: dict[int, T] = {}
         try:
-            for piece in pieces:
+            for number, piece in enumerate(pieces):
                 made.append(piece)
-                helpers.append(self._pool().submit(work, *piece))
-            for number, helper in enumerate(helpers):
-                if helper.cancel():
-                    own[number] = work(*made[number])
+                for helper in self._begin(work, *piece):
+                    helpers[number] = helper
+            for number, piece in enumerate(made):
+                if number not in helpers or helpers[number].cancel():
+                    own[number] = work(*piece)
         finally:
-            errors = _ended(helpers)
+            errors = _ended([*helpers.values()])
         for error in errors:
             raise error
-        return [own[number] if number in own else helper.result() for number, helper in enumerate(helpers)]
+        return [own[number] if number in own else helpers[number].result() for number in range(len(made))]
 
     def shares(self, size: int, unit: int = 1) -> list[tuple[int, int]]:
         """Divide a list, of whole units and a rest, into pieces: where each begins and ends. None is empty.
@@ -102,20 +106,49 @@ class Team:
         bounds = [k * (size // unit) // count * unit for k in range(count)] + [size]
         return [(first, end) for first, end in pairwise(bounds) if first < end]
 
-    def _pool(self) -> ThreadPoolExecutor:
-        """The other threads; a process that was forked off has none of those of its parent, and gets its own."""
+    def _begin(self, work: Callable[..., T], *arguments: Any) -> 'list[Future[T]]':
+        """Have another thread do a piece of work; none where there are no others, or no more as the process ends."""
+        # A process that was forked off has none of the threads of its parent.
         if self._others is None or not all(thread.is_alive() for thread in self._threads):
-            threads: list[threading.Thread] = []
-            self._others = ThreadPoolExecutor(
-                self.size - 1, 'extractor', lambda: threads.append(threading.current_thread()))
-            self._threads = threads
-        return self._others
+            self._threads = []
+            self._others = _started(self.size - 1, self._threads)
+        with contextlib.suppress(RuntimeError):
+            return [self._others.submit(work, *arguments)] if self._threads else []
+        return []
+
+
+def _started(count: int, threads: list[threading.Thread]) -> ThreadPoolExecutor:
+    """So many threads, which are put on the list; none where the system has not so many."""
+    pool, all_there = ThreadPoolExecutor(count, 'extractor'), threading.Event()
+
+    def appear() -> None:
+        all_there.wait()
+        threads.append(threading.current_thread())
+
+    try:
+        waiting = [pool.submit(appear) for _ in range(count)]
+    except RuntimeError:
+        pool.shutdown(wait=False, cancel_futures=True)
+        waiting = []
+    all_there.set()
+    wait(waiting)
+    return pool
 
 
 def _ended(helpers: 'list[Future[Any]]') -> list[BaseException]:
     """Wait until nobody works any more, as the memory is used again; what has not begun is left. Return the errors."""
-    errors = [helper.exception() for helper in helpers if not helper.cancel()]
-    return [error for error in errors if error is not None]
+    busy = [helper for helper in helpers if not helper.cancel()]
+    _wait_for_all(busy)
+    return [error for error in (helper.exception() for helper in busy) if error is not None]
+
+
+def _wait_for_all(helpers: 'list[Future[Any]]') -> None:
+    """Wait for their end, however often somebody presses Ctrl-C meanwhile; the interrupt is raised then."""
+    try:
+        wait(helpers)
+    finally:
+        if not all(helper.done() for helper in helpers):
+            _wait_for_all(helpers)
 
 
 #: The calling thread and no other.
