@@ -13,7 +13,8 @@ from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.edges import STENCILS, deriche_stencil, intensity_map
 from line_feature_node.core.parameters import Parameters
 
-#: The noise is measured in this many rows, or a few more, and in one of at least so many; in about so many columns.
+#: The noise is measured in this many rows, or a few more, and in one of at least so many; in this many columns, or up to
+#: twice as many.
 ROWS, EVERY, COLUMNS = 30, 16, 640
 #: Bins of the histogram that the median is taken from, and how many there are to a grey level.
 BINS, RESOLUTION = 4096, 4
@@ -124,7 +125,7 @@ def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
     every, turns = max(height // ROWS, EVERY), max(width // COLUMNS, 1)
     for row in range(max(min(1 + every // 2, height // 2), 1), height - 1, every):
         above, middle, below = image[row - 1], image[row], image[row + 1]
-        # Rows take turns at the columns, or a pattern that repeats would be seen at one place of it only.
+        # Rows take turns at the columns, or upright stripes might be seen at one place of them only.
         for i in range(1 + row // every % turns, width - 1, turns):
             if keep.size > 0 and not (keep[row - 1, i] and keep[row, i] and keep[row + 1, i]
                                       and keep[row, i - 1] and keep[row, i + 1]):

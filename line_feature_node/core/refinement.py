@@ -103,8 +103,8 @@ SAME_DIRECTION = 9
 INDEPENDENT = 0.8
 #: Peaks are known to a fiftieth of a pixel at best, in whole grey levels.
 LEAST_VARIANCE = 0.02**2
-#: Norms are counted in every so many rows and columns, fewer where more than so many of each would be, in bins of so
-#: many units of the gradient.
+#: Norms are counted in every so many rows and columns, in fewer of a large picture, about so many of each, and in bins
+#: of so many units of the gradient.
 COUNT_ROWS, COUNT_COLUMNS, MOST_ROWS, MOST_COLUMNS, NORM_BINS, NORM_BIN = 8, 2, 60, 320, 4096, 4
 #: From one row where norms are counted to the next the place among so many rows moves by this part of them: the
 #: golden section, so that it is soon everywhere among them.
