@@ -535,12 +535,14 @@ class _Copier:
         """
         with told(self._path):
             for connection, stamp, data in self._reader.messages(self._sources, start, stop) if self._sources else ():
-                copied = self._converted(connection, data)
+                copied = self._converted(connection, stamp, data)
                 if copied is not None:
                     yield stamp, self._targets[connection.id], copied
 
-    def _converted(self, connection: Connection, data: bytes) -> bytes | None:
+    def _converted(self, connection: Connection, stamp: int, data: bytes) -> bytes | None:
         try:
+            if not isinstance(stamp, int) or stamp < 0:  # tables of sqlite3 have anything anywhere
+                raise ValueError(f'no time: {stamp!r} where nanoseconds are expected')
             if not isinstance(data, Buffer):
                 raise ValueError(f'no {connection.msgtype}: {type(data).__name__} where bytes are expected')
             return as_ros2(self._types, data, connection.msgtype) if self._ros1 else data

@@ -138,6 +138,8 @@ def _read(reader: Reader, images: list[Any], part: Slice) -> Iterator[_Step]:
     counts = dict(zip(part.topics, part.skipped or (0,) * len(part.topics), strict=True))
     before: list[int] = []
     for connection, stamp, data in reader.messages(images, part.start, part.stop):
+        if not isinstance(stamp, int):  # tables of sqlite3 have anything anywhere
+            raise ValueError(f'a message has {stamp!r} in the place of its time')
         if len(before) >= part.after:
             number = counts[connection.topic]
             if number % part.every == 0:

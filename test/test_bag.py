@@ -600,6 +600,19 @@ def test_what_a_table_has_in_the_place_of_messages_is_counted(tmp_path, value, k
     assert len(outcome.frames.good) == 2
 
 
+@pytest.mark.parametrize('value', ["'noon'", "x'00'", '4.5'])
+@pytest.mark.parametrize('row', [2, 4])
+def test_messages_with_something_else_in_the_place_of_their_time_are_not_copied(tmp_path, value, row):
+    path = write(tmp_path / 'rec', [*film(3), ('/words', TEXT, stamp_of(2) + 1, text('good'))], 'sqlite3')
+    database = sqlite3.connect(next(path.glob('*.db3')))
+    with database:
+        database.execute(f'UPDATE messages SET timestamp = {value} WHERE id = {row}')
+    database.close()
+    outcome = process(path, tmp_path / 'out', copy=True)
+    assert len(outcome.frames.good) == 3 - (row == 2)
+    assert all(': no time: ' in name for name in outcome.spoilt)
+
+
 def test_bad_messages_are_not_copied_but_counted_and_the_rest_goes_on(tmp_path):
     entries = [*film(3, types=ROS1), ('/words', TEXT, stamp_of(2), text('good', ROS1)),
                *(('/words', TEXT, stamp_of(number), b'\xff\0\0\0') for number in (0, 1))]
