@@ -5,6 +5,7 @@ import io
 import pickle
 from collections import Counter, deque
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -35,13 +36,23 @@ from line_feature_node.bag import Run, process_recording
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, Parameters
 from line_feature_node.messages import segments_of
 from line_feature_node.overlay import COLOURS
-from line_feature_node.recordings import DECODERS, OUTPUTS, RecordingError, deserialize, find_recordings, opened, plan
+from line_feature_node.recordings import (
+    DECODERS,
+    OUTPUTS,
+    RecordingError,
+    Slice,
+    deserialize,
+    find_recordings,
+    opened,
+    plan,
+)
 from line_feature_node.slices import (
     CSV,
     LIMIT,
     MESSAGES,
     Frame,
     Job,
+    _read,
     pack,
     process_slice,
     rests,
@@ -716,3 +727,16 @@ def read_by_ros(path, kind):
         connections = [connection for connection in reader.connections if connection.msgtype == kind]
         return [serialization.deserialize_message(bytes(data), ros_type(kind))
                 for _, _, data in reader.messages(connections)]
+
+
+def test_a_message_without_a_time_is_an_error():
+    """A wrong byte in an index of sqlite3 makes None of it; there is no place to put such a frame."""
+    class Index:
+        def messages(self, *_):
+            yield SimpleNamespace(topic='/camera'), 5, b''
+            yield SimpleNamespace(topic='/camera'), None, b''
+
+    steps = _read(Index(), [], Slice(Path('rec'), ('/camera',), 0, 10))
+    assert next(steps).stamp == 5
+    with pytest.raises(ValueError, match='a message has None in the place of its time'):
+        next(steps)
