@@ -83,6 +83,8 @@ def bag(
             check_report(report, pairs, overwrite=overwrite)
         crew = cluster(scheduler) if scheduler else local(workers)
     except (RecordingError, TargetError, WorkersError, ValueError) as error:
+        if as_json:
+            print(json.dumps({'recordings': [], 'error': str(error)}))
         fail(str(error))
     outcomes = _process_all(pairs, run, crew, quiet=quiet or as_json, salvage=salvage)
     status = _status(outcomes)

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from line_feature_node.core import PROFILES, Parameters
+from line_feature_node.core.parameters import Spec
 from line_feature_node.options import Options
 from line_feature_node.parameter_files import read_parameter_file
 
@@ -54,13 +55,12 @@ def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
         'params-file': (Path, 'Parameter file (YAML) of a ROS 2 node, whose values are taken.'),
         'profile': (str, f'Set of parameters to start from: {", ".join(PROFILES)}; default default.')}
     for name, spec in Parameters.specs().items():
-        unit = f' ({spec.unit})' if spec.unit else ''
         default = getattr(Parameters(), name)
         kind = types.GenericAlias(tuple, (float,) * len(default)) if isinstance(default, tuple) else type(default)
-        options[name] = (kind, f'{spec.description} {spec.range}{unit}; default {default}.')
+        options[name] = (kind, f'{spec.description} {_range(name, spec, default)}.')
     added = [
-        inspect.Parameter(name.replace('-', '_'), inspect.Parameter.KEYWORD_ONLY,
-                          default=typer.Option(None, f'--{name}', help=text), annotation=Optional[kind])
+        inspect.Parameter(name.replace('-', '_'), inspect.Parameter.KEYWORD_ONLY, annotation=Optional[kind], default=(
+            typer.Option(None, f'--{name}/--no-{name}' if kind is bool else f'--{name}', help=text)))
         for name, (kind, text) in options.items()]
     described = [*(signature.parameters[name] for name in kept), *added]
     run.__name__, run.__doc__ = command.__name__, command.__doc__
@@ -68,6 +68,17 @@ def with_parameters(command: Callable[..., None]) -> Callable[..., None]:
     vars(run)['__signature__'] = signature.replace(parameters=described)
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in described}
     return run
+
+
+def _range(name: str, spec: Spec, default: Any) -> str:
+    """The values that an option takes, and its default, as the help has them."""
+    if isinstance(default, bool):
+        return f'Default --{"" if default else "no-"}{name}'
+    unit = f' ({spec.unit})' if spec.unit else ''
+    if isinstance(default, tuple):
+        given = ' '.join(f'{number:g}' for number in default)
+        return f'{spec.range}{unit}, with spaces between; default --{name} {given}'
+    return f'{spec.range}{unit}; default {default}'
 
 
 def _parameters(path: Path | None, profile: str | None, given: dict[str, Any]) -> tuple[Parameters, str, Options]:

@@ -29,6 +29,17 @@ def photo(tmp_path):
     return path
 
 
+def test_refinement_is_turned_off_by_an_option(run, photo, tmp_path):
+    """Of segments that are not refined the last fields are not known."""
+    result = run('image', photo, '--out', tmp_path / 'out', '--no-refine')
+    assert result.exit_code == 0, result.output
+    with (tmp_path / 'out' / 'photo-segments.csv').open() as file:
+        assert {row['sigma_theta'] for row in csv.DictReader(file)} == {'nan'}
+    assert run('image', photo, '--out', tmp_path / 'again', '--refine').exit_code == 0
+    assert '--refine / --no-refine' in run('image', '--help').output
+    assert 'default --roi 0 0 1 1' in run('image', '--help').output
+
+
 def test_an_image_gives_an_overlay_and_a_table(run, photo, tmp_path):
     result = run('image', photo, '--out', tmp_path / 'out')
     assert result.exit_code == 0, result.output
