@@ -580,7 +580,7 @@ def test_interrupts_while_workers_start_are_one_line(long, tmp_path, delay):
     assert errors == 'SIGINT: ended before all was done; --resume goes on from there\n'
 
 
-def test_scripts_get_their_line_when_nothing_is_there_to_be_read(run, tmp_path):
+def test_scripts_get_their_line_when_nothing_is_there_to_be_read(tmp_path):
     result = run(tmp_path / 'none', '--out', tmp_path / 'out', '--json')
     assert result.exit_code == 2
     assert json.loads(result.stdout) == {
