@@ -204,7 +204,8 @@ threading.Thread(target=late).start()
 
 
 @pytest.mark.parametrize('way', ['each', 'pipe'])
-def test_an_interrupt_waits_for_the_others(way: str) -> None:
+@pytest.mark.parametrize('pause', [0, 0.2], ids=['at work', 'while it waits'])
+def test_an_interrupt_waits_for_the_others(way: str, pause: float) -> None:
     """They write into memory that the next frame uses."""
     team, began, quiet = Team(2), threading.Event(), threading.Event()
     main = threading.get_ident()
@@ -214,6 +215,7 @@ def test_an_interrupt_waits_for_the_others(way: str) -> None:
             began.wait(10)
             return
         began.set()
+        time.sleep(pause)
         signal.pthread_kill(main, signal.SIGINT)
         time.sleep(0.3)
         quiet.set()
