@@ -113,8 +113,6 @@ FAULTS = {
         ('direction + SAME_DIRECTION) & DIRECTIONS - 1', 'direction + SAME_DIRECTION)'),
         ('low + CELL * at_first - CLAIM', 'low + CELL * at_first + CLAIM'),
         ('at_first += hits > count', 'at_first += hits >= count'),
-        ('if not is_along(claims[index], own):', 'if True:'),
-        ("line['begin'] > line['first'] or line['end']", "line['begin'] < line['first'] or line['end']"),
         ("-line['sign'] if line['steep'] and not turned", "-line['sign'] if line['steep']"),
         ('math.atan2(cos, -sin)', 'math.atan2(cos, sin)'),
         ('* scale * scale', '* scale'),
