@@ -586,14 +586,19 @@ def test_definitions_of_a_lone_file_give_the_hashes_of_ros2(tmp_path):
     assert {topic: copied[topic].digest for topic in hashes} == hashes
 
 
-@pytest.mark.parametrize(('value', 'kind'), [("'text'", 'str'), ('4.0e300', 'float'), ('5', 'int')])
-def test_what_a_table_has_in_the_place_of_messages_is_counted(tmp_path, value, kind):
-    path = write(tmp_path / 'rec', [*film(3), ('/words', TEXT, stamp_of(2) + 1, text('good'))], 'sqlite3')
+def altered(folder, statement):
+    """A recording of sqlite3, of images and a text, after some SQL."""
+    path = write(folder / 'rec', [*film(3), ('/words', TEXT, stamp_of(2) + 1, text('good'))], 'sqlite3')
     database = sqlite3.connect(next(path.glob('*.db3')))
     with database:
-        database.execute(f'UPDATE messages SET data = {value} WHERE id IN (2, 4)')
+        database.execute(statement)
     database.close()
-    outcome = process(path, tmp_path / 'out', copy=True)
+    return path
+
+
+@pytest.mark.parametrize(('value', 'kind'), [("'text'", 'str'), ('4.0e300', 'float'), ('5', 'int')])
+def test_what_a_table_has_in_the_place_of_messages_is_counted(tmp_path, value, kind):
+    outcome = process(altered(tmp_path, f'UPDATE messages SET data = {value} WHERE id IN (2, 4)'), tmp_path / 'out', copy=True)
     assert dict(outcome.failed) == {f'no {IMAGE}: {kind} where bytes are expected': 1}
     assert dict(outcome.spoilt) == {f'/camera: no {IMAGE}: {kind} where bytes are expected': 1,
                                     f'/words: no {TEXT}: {kind} where bytes are expected': 1}
@@ -603,12 +608,7 @@ def test_what_a_table_has_in_the_place_of_messages_is_counted(tmp_path, value, k
 @pytest.mark.parametrize('value', ["'noon'", "x'00'", '4.5'])
 @pytest.mark.parametrize('row', [2, 4])
 def test_messages_with_something_else_in_the_place_of_their_time_are_not_copied(tmp_path, value, row):
-    path = write(tmp_path / 'rec', [*film(3), ('/words', TEXT, stamp_of(2) + 1, text('good'))], 'sqlite3')
-    database = sqlite3.connect(next(path.glob('*.db3')))
-    with database:
-        database.execute(f'UPDATE messages SET timestamp = {value} WHERE id = {row}')
-    database.close()
-    outcome = process(path, tmp_path / 'out', copy=True)
+    outcome = process(altered(tmp_path, f'UPDATE messages SET timestamp = {value} WHERE id = {row}'), tmp_path / 'out', copy=True)
     assert len(outcome.frames.good) == 3 - (row == 2)
     assert all(': no time: ' in name for name in outcome.spoilt)
 
