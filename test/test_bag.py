@@ -598,7 +598,8 @@ def altered(folder, statement):
 
 @pytest.mark.parametrize(('value', 'kind'), [("'text'", 'str'), ('4.0e300', 'float'), ('5', 'int')])
 def test_what_a_table_has_in_the_place_of_messages_is_counted(tmp_path, value, kind):
-    outcome = process(altered(tmp_path, f'UPDATE messages SET data = {value} WHERE id IN (2, 4)'), tmp_path / 'out', copy=True)
+    path = altered(tmp_path, f'UPDATE messages SET data = {value} WHERE id IN (2, 4)')
+    outcome = process(path, tmp_path / 'out', copy=True)
     assert dict(outcome.failed) == {f'no {IMAGE}: {kind} where bytes are expected': 1}
     assert dict(outcome.spoilt) == {f'/camera: no {IMAGE}: {kind} where bytes are expected': 1,
                                     f'/words: no {TEXT}: {kind} where bytes are expected': 1}
@@ -608,7 +609,8 @@ def test_what_a_table_has_in_the_place_of_messages_is_counted(tmp_path, value, k
 @pytest.mark.parametrize('value', ["'noon'", "x'00'", '4.5'])
 @pytest.mark.parametrize('row', [2, 4])
 def test_messages_with_something_else_in_the_place_of_their_time_are_not_copied(tmp_path, value, row):
-    outcome = process(altered(tmp_path, f'UPDATE messages SET timestamp = {value} WHERE id = {row}'), tmp_path / 'out', copy=True)
+    path = altered(tmp_path, f'UPDATE messages SET timestamp = {value} WHERE id = {row}')
+    outcome = process(path, tmp_path / 'out', copy=True)
     assert len(outcome.frames.good) == 3 - (row == 2)
     assert all(': no time: ' in name for name in outcome.spoilt)
 
