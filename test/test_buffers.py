@@ -26,6 +26,19 @@ def test_an_image_has_exactly_its_size():
     assert buffers.image('a', 5, 4, np.uint8).shape == (5, 4)
 
 
+def test_images_of_several_sizes_share_memory_and_begin_as_zeros():
+    """A camera that is switched to and fro takes no more than its largest picture."""
+    buffers = Buffers()
+    largest = buffers.image('a', 40, 50, np.float32)
+    for height, width, dtype in [(30, 20, np.float32), (40, 50, np.int16), (40, 50, np.float32)]:
+        image = buffers.image('a', height, width, dtype)
+        assert (image.shape, image.dtype, image.flags.c_contiguous) == ((height, width), dtype, True)
+        assert not image.any()
+        assert np.shares_memory(image, largest)
+        image[:] = 7
+    assert buffers.last_image('a') is image
+
+
 def test_the_hot_path_allocates_nothing():
     """After the first frames of a video every array is one that was there before."""
     extractor = LineFeatureExtractor()

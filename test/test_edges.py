@@ -9,6 +9,7 @@ from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.edges import (
     CODE,
     MARGIN,
+    OPEN,
     PAD,
     STENCILS,
     STRONG,
@@ -246,12 +247,14 @@ def test_suppression_and_thresholds(operator: dict[str, Any], shape: tuple[int, 
         stays, strong = (marks & CODE) != 0, (marks & STRONG) != 0
         np.testing.assert_array_equal(stays[clear], ((parts > 0) & (norm > T2))[clear])
         np.testing.assert_array_equal(strong[clear], (stays & (norm > T1))[clear])
-        assert not (marks & ~np.uint8(CODE | STRONG)).any()
+        assert not (marks & ~np.uint8(CODE | OPEN | STRONG)).any()
+        np.testing.assert_array_equal(stays, (marks & OPEN) != 0)
         assert (norm[stays] > T2 - 1e-3).all()
         assert clear.mean() > 0.8
 
 
-@pytest.mark.parametrize(('T1', 'T2', 'mark'), [(8.0, 2.0, 1), (7.9, 2.0, 1 | STRONG), (9.0, 8.0, 0), (9.0, 7.9, 1)])
+@pytest.mark.parametrize(('T1', 'T2', 'mark'), [
+    (8.0, 2.0, OPEN | 1), (7.9, 2.0, OPEN | STRONG | 1), (9.0, 8.0, 0), (9.0, 7.9, OPEN | 1)])
 def test_a_gradient_of_just_a_threshold_does_not_exceed_it(T1: float, T2: float, mark: int) -> None:
     """That of Sobel's operator is exactly 8 at a step of 16 grey levels."""
     marks = marks_of(step(16, 8, 100, 116, axis=1), operator='sobel', T1=T1, T2=T2)

@@ -164,12 +164,16 @@ def test_camera_that_is_killed_in_the_middle_of_a_message_does_no_harm(bench, st
     """No more than its last pictures are lost, and the next camera is served."""
     process = start()
     segments, numbers = bench.listen(), itertools.count(1)
-    killed = run(CAMERA)
-    for _ in range(3):
-        until_said(killed, 'sending')
-    time.sleep(0.002)  # into publish(), which takes longer
-    killed.kill()
-    assert 'sent' not in killed.stdout.read()
+    for _ in range(10):  # where other processes hold this one up, it comes too late
+        killed = run(CAMERA)
+        for _ in range(3):
+            until_said(killed, 'sending')
+        time.sleep(0.002)  # into publish(), which takes longer
+        killed.kill()
+        if 'sent' not in killed.stdout.read():
+            break
+    else:
+        pytest.fail('no camera was killed in the middle of a message')
     camera = bench.camera()
     for _ in range(5):
         number = ask(bench, camera, segments, numbers)

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
-from line_feature_node.core.edges import MARGIN, STRONG
+from line_feature_node.core.edges import MARGIN, OPEN, STRONG
 from line_feature_node.core.parameters import Parameters
 from line_feature_node.core.scanning import TAKEN, chain_directions, joined, scan_edges, trace_edges
 
@@ -47,7 +47,7 @@ def marks_of(codes: NDArray[np.uint8], strong: Any = True) -> NDArray[np.uint8]:
     """Marks as edge extraction leaves them: padded, and rows a multiple of eight long."""
     height, width = codes.shape
     marks = np.zeros((height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8), np.uint8)
-    marks[MARGIN:MARGIN + height, MARGIN:MARGIN + width] = codes + STRONG * ((codes > 0) & strong)
+    marks[MARGIN:MARGIN + height, MARGIN:MARGIN + width] = codes + OPEN * (codes > 0) + STRONG * ((codes > 0) & strong)
     return marks
 
 

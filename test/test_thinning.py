@@ -4,11 +4,11 @@ import pytest
 from numpy.typing import NDArray
 
 from line_feature_node.core import LineFeatureExtractor, Parameters, extract
-from line_feature_node.core.edges import STRONG
+from line_feature_node.core.edges import OPEN, STRONG
 from line_feature_node.core.thinning import connected, thin
 
 BOTH = pytest.mark.parametrize('profile', ['default', 'paper'])
-BAR = np.pad(np.full((6, 60), 1 | STRONG, np.uint8), 12)
+BAR = np.pad(np.full((6, 60), 1 | OPEN | STRONG, np.uint8), 12)
 
 
 def picture(seed: int = 0) -> NDArray[np.uint8]:
@@ -23,7 +23,7 @@ def picture(seed: int = 0) -> NDArray[np.uint8]:
 def test_weak_edges_stay_only_beside_strong_ones():
     marks = np.zeros((8, 16), np.uint8)
     marks[2, 2:6] = 3
-    marks[3, 6] = 2 | STRONG
+    marks[3, 6] = 2 | OPEN | STRONG
     marks[6, 9:13] = 3
     expected = np.zeros((8, 16), np.uint8)
     expected[2, 2:6] = expected[3, 6] = 1
@@ -49,7 +49,7 @@ def test_thinning_keeps_what_hangs_together_and_nothing_thick(seed):
     """As many parts and holes as before, and no square of four left but at crossings."""
     marks = np.zeros((90, 96), np.uint8)
     for x1, y1, x2, y2 in np.random.default_rng(seed).integers(8, 82, (6, 4)).tolist():
-        cv2.line(marks, (x1, y1), (x2, y2), 1 | STRONG, 5)
+        cv2.line(marks, (x1, y1), (x2, y2), 1 | OPEN | STRONG, 5)
     before = (marks != 0).astype(np.uint8)
     thin(marks)
     after = (marks != 0).astype(np.uint8)

@@ -7,7 +7,7 @@ from numpy.typing import DTypeLike, NDArray
 
 
 class Buffers:
-    """Arrays by name. Lists are as long as the largest frame so far needed them, images as large as the last frame.
+    """Arrays by name, in as much memory as the largest frame so far needed.
 
     What an array holds at first is unspecified, but for those asked for with ``zeros``: their users leave them as
     they found them, all zero.
@@ -15,6 +15,7 @@ class Buffers:
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
+        self._images: dict[str, NDArray[Any]] = {}
         self._parts: list[Buffers] = []
 
     def parts(self, count: int) -> 'list[Buffers]':
@@ -34,12 +35,18 @@ class Buffers:
         return array
 
     def image(self, name: str, height: int, width: int, dtype: DTypeLike) -> NDArray[Any]:
-        """A two-dimensional array of exactly that size, zero when it is new."""
-        array = self._arrays.get(name)
-        if array is None or array.shape != (height, width) or array.dtype != dtype:
-            array = self._arrays[name] = np.zeros((height, width), dtype)
-        return array
+        """A two-dimensional array of exactly that size; all zero when it is another than last time.
 
-    def last(self, name: str) -> NDArray[Any]:
-        """The array that was last asked for by this name."""
-        return self._arrays[name]
+        Frames of several sizes by turns share its memory, which would soon be in pieces if each had its own.
+        """
+        image = self._images.get(name)
+        if image is None or image.shape != (height, width) or image.dtype != dtype:
+            size = height * width * np.dtype(dtype).itemsize
+            image = self.array(name, size, np.uint8)[:size].view(dtype).reshape(height, width)
+            image.fill(0)
+            self._images[name] = image
+        return image
+
+    def last_image(self, name: str) -> NDArray[Any]:
+        """The image that was last asked for by this name."""
+        return self._images[name]

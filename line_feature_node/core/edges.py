@@ -26,6 +26,8 @@ from line_feature_node.core.vectors import LANES, TILE, load, multiply, multiply
 CODE = 7
 #: In a mark: the pixel also exceeds T1.
 STRONG = 8
+#: In a mark: there is a code, and no chain has the pixel yet.
+OPEN = 128
 
 #: Replicated pixels on each side of a plane, and of zeros on each side of the marks.
 PAD, MARGIN = 2, 1
@@ -38,7 +40,8 @@ FLAT = np.float32(1e-3)
 TIE, ROUNDING = np.float32(2e-5), np.float32(1e-4)
 ONE = np.float32(1)
 #: Marks as single bytes, so that a row of them is computed as bytes.
-NO_MARK, CODE_1, CODE_2, CODE_3, CODE_4, STRONG_MARK = (np.uint8(mark) for mark in (0, 1, 2, 3, 4, STRONG))
+NO_MARK, STRONG_MARK = np.uint8(0), np.uint8(STRONG)
+CODE_1, CODE_2, CODE_3, CODE_4 = (np.uint8(OPEN | code) for code in (1, 2, 3, 4))
 #: Half a section of the gradient space is 22.5 degrees.
 SECTION = np.float32(math.tan(math.pi / 8))
 #: White, where parameters do not say it, by the kind and the bytes of pixels.
@@ -64,9 +67,9 @@ def extract_edges(
         team: Who does the work.
 
     Returns:
-        Marks, uint8: the CODE of each pixel that passed the suppression (where that is the way of thinning) and
-        exceeds T2, with STRONG where it exceeds T1, and 0 elsewhere; padded by MARGIN on each side, and at the right to
-        a multiple of eight columns.
+        Marks, uint8: OPEN and the CODE of each pixel that passed the suppression (where that is the way of thinning)
+        and exceeds T2, with STRONG where it exceeds T1, and 0 elsewhere; padded by MARGIN on each side, and at the
+        right to a multiple of eight columns.
     """
     height, width = image.shape
     # Whole strips of rows and whole tiles of columns fit in, with the padding.
@@ -147,8 +150,8 @@ class Gradient(NamedTuple):
 
 def kept_gradient(buffers: Buffers) -> Gradient:
     """The gradient of the last image, where lines are refined."""
-    values = buffers.last('gradient')
-    return Gradient(values.reshape(values.shape[0], -1, 2), float(buffers.last('unit')[0]))
+    values = buffers.last_image('gradient')
+    return Gradient(values.reshape(values.shape[0], -1, 2), float(buffers.array('unit', 1, np.float64)[0]))
 
 
 def intensity_map(dtype: 'np.dtype[Any]', parameters: Parameters) -> tuple[float, float]:

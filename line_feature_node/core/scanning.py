@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
-from line_feature_node.core.edges import CODE, STRONG
+from line_feature_node.core.edges import CODE, OPEN, STRONG
 from line_feature_node.core.indices import are_neighbours, position
 from line_feature_node.core.parameters import Parameters
 
@@ -33,12 +33,12 @@ TAKEN = 16
 BRIDGED = 64
 #: With TAKEN: a chain that may be linked ends here.
 ENDING = 32
-#: The bits of a candidate that no chain has yet.
-CANDIDATE = CODE | STRONG
 #: The strong bit of eight marks at once.
 STRONG_WORD = np.uint64(STRONG * 0x0101010101010101)
 #: In place of a state: the chain ends.
 END = 255
+#: How many states there are, and the bits of one or of END.
+STATES, STATE_BITS = 16, 8
 #: A chain turns by at most this many directions at once.
 SHARPEST = 2
 #: The direction of a chain at its end is measured over this many pixels.
@@ -51,8 +51,8 @@ def _next_state() -> NDArray[np.uint8]:
     A state is 2 (direction) + (whether the last turn was to the right). Bit d of the mask stands for an unvisited
     neighbour in direction d.
     """
-    table = np.full((16, 256), END, np.uint8)
-    for state in range(16):
+    table = np.full((STATES, 256), END, np.uint8)
+    for state in range(STATES):
         direction, right = divmod(state, 2)
         back = -1 if right else 1
         turns = [0, *(k * sign for k in range(1, SHARPEST + 1) for sign in (back, -back))]
@@ -90,9 +90,14 @@ NEXT_STATE = _next_state()
 
 
 @lru_cache(maxsize=8)
-def _state_steps(stride: int) -> NDArray[np.int64]:
-    """What a step in the direction of each state adds to a flat index."""
-    return np.repeat(STEP_X + stride * STEP_Y, 2)
+def _moves(stride: int) -> NDArray[np.int64]:
+    """Where a chain goes on, at 256 (state) + (mask), for marks with rows of a length.
+
+    One number has both the next state, as in NEXT_STATE, and, STATE_BITS higher, what the step there adds to a flat
+    index: to look up one by the other would take longer.
+    """
+    steps = np.append(np.repeat(STEP_X + stride * STEP_Y, 2), 0)
+    return ((steps[np.minimum(NEXT_STATE, STATES)] << STATE_BITS) + NEXT_STATE).reshape(-1)
 
 
 FAN, FAN_OFFSETS = _fan(8)
@@ -160,13 +165,13 @@ def trace_edges(marks: NDArray[np.uint8], parts: int, buffers: Buffers) -> Itera
     flat, (height, stride) = marks.reshape(-1), marks.shape
     most = int(np.count_nonzero(flat))
     pixels, codes = buffers.array('raw pixels', most, np.int32), buffers.array('raw codes', most, np.uint8)
-    offsets, stack = buffers.array('raw offsets', most + 1, np.int32), buffers.array('stack', most, np.int32)
+    offsets, stack = buffers.array('raw offsets', most + 1, np.int32), buffers.array('stack', most + 1, np.int32)
     bridged = buffers.array('not bridged', most, np.bool_, zeros=True)
     closed = buffers.array('not closed', most, np.bool_, zeros=True)
     offsets[0] = count = 0
     for first, end in pairwise(k * height // parts * stride for k in range(parts + 1)):
         before = count
-        count = trace(first, end, flat, flat.view(np.uint64), stride, NEXT_STATE, _state_steps(stride), pixels, codes,
+        count = trace(first, end, flat, flat.view(np.uint64), stride, _moves(stride), pixels, codes,
                       offsets, before, stack)
         length = offsets[count]
         yield Chains(pixels[:length], codes[:length], bridged[:length], offsets[before:count + 1],
@@ -189,8 +194,8 @@ def chain_directions(chains: Chains, stride: int) -> NDArray[np.uint8]:
 
 @kernel
 def trace(
-    first: int, end: int, marks: Any, words: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any,
-    offsets: Any, chains: int, stack: Any,
+    first: int, end: int, marks: Any, words: Any, stride: int, moves: Any, pixels: Any, codes: Any, offsets: Any,
+    chains: int, stack: Any,
 ) -> int:
     """Visit all candidates that are connected to a strong one between two marks; return how many chains there are then.
 
@@ -198,95 +203,120 @@ def trace(
         first, end: The marks, multiples of eight.
         chains: How many chains there are before.
     """
-    length = offsets[chains]
+    length = np.int64(offsets[chains])
     for word in range(first // 8, end // 8):
         if words[word] & STRONG_WORD == 0:
             continue
         for seed in range(8 * word, 8 * word + 8):
             if marks[seed] & STRONG == 0:
                 continue
-            length, top = trace_chain(seed, marks, stride, table, steps, pixels, codes, length, stack, 0)
-            chains += 1
-            offsets[chains] = length
-            while top > 0:
-                top -= 1
-                beside = stack[top]
-                for direction in range(8):
-                    start = beside + steps[2 * direction]
-                    if marks[start] & CANDIDATE:
-                        length, top = trace_chain(
-                            start, marks, stride, table, steps, pixels, codes, length, stack, top)
-                        chains += 1
-                        offsets[chains] = length
+            start, beside, direction, top = seed, seed, 8, 0
+            while start != -1:
+                length, top = trace_chain(start, marks, stride, moves, pixels, codes, length, stack, top)
+                chains += 1
+                offsets[chains] = length
+                start, beside, direction, top = next_start(beside, direction, marks, stride, stack, top)
     return chains
 
 
-@kernel
+@inlined
+def next_start(
+    beside: int, direction: int, marks: Any, stride: int, stack: Any, top: int,
+) -> tuple[int, int, int, int]:
+    """The next candidate beside a pixel, from a direction on, or beside those on the stack.
+
+    Returns:
+        It, -1 where there is none; what it is beside, and the direction after it; the number of entries on the stack.
+    """
+    while True:
+        mask = open_neighbours(marks, beside, stride) >> direction
+        if mask != 0:
+            while mask & 1 == 0:
+                mask >>= 1
+                direction += 1
+            return beside + STEP_X[direction] + stride * STEP_Y[direction], beside, direction + 1, top
+        if top == 0:
+            return -1, beside, direction, top
+        top -= 1
+        beside, direction = np.int64(stack[top]), 0
+
+
+@inlined
 def trace_chain(
-    start: int, marks: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any, length: int, stack: Any,
-    top: int,
+    start: int, marks: Any, stride: int, moves: Any, pixels: Any, codes: Any, length: int, stack: Any, top: int,
 ) -> tuple[int, int]:
     """Append the chain through a pixel: first its arm against the edge's direction, turned round, then that along it.
 
     Returns:
         The number of pixels in all chains, and of entries on the stack.
     """
-    first = length
-    code = marks[start] & CODE
-    direction = (code + 1) % 4
+    first, code = length, marks[start] & CODE
+    direction = (np.int64(code) + 1) % 4
     marks[start] = TAKEN
-    length, top = walk(start, (direction + 4) % 8, marks, stride, table, steps, pixels, codes, length, stack, top)
-    reverse(pixels, first, length)
-    reverse(codes, first, length)
+    mask = open_neighbours(marks, start, stride)
+    alone = mask == 0
+    if not alone:
+        length, top = walk(start, (direction + 4) % 8, mask, marks, stride, moves, pixels, codes, length, stack, top)
+        reverse(pixels, first, length)
+        reverse(codes, first, length)
     pixels[length] = start
     codes[length] = code
-    length, top = walk(start, direction, marks, stride, table, steps, pixels, codes, length + 1, stack, top)
-    if open_neighbours(marks, start, stride) != 0:
+    length += 1
+    if not alone:
+        mask = open_neighbours(marks, start, stride)
+        length, top = walk(start, direction, mask, marks, stride, moves, pixels, codes, length, stack, top)
         stack[top] = start
-        top += 1
+        top += open_neighbours(marks, start, stride) != 0
     return length, top
 
 
 @inlined
 def walk(
-    start: int, direction: int, marks: Any, stride: int, table: Any, steps: Any, pixels: Any, codes: Any, length: int,
+    start: int, direction: int, mask: int, marks: Any, stride: int, moves: Any, pixels: Any, codes: Any, length: int,
     stack: Any, top: int,
 ) -> tuple[int, int]:
-    """Append the pixels that follow the start in a direction, and put those beside which others stay on the stack."""
+    """Append the pixels that follow the start in a direction, and put those beside which others stay on the stack.
+
+    Every pixel is written on top of the stack, and most are not kept there: to ask before would be a branch that no
+    processor can predict.
+
+    Args:
+        mask: The neighbours of the start.
+    """
     pixel = start
-    following = table[2 * direction, open_neighbours(marks, pixel, stride)]
+    following = moves[np.uint64(512 * direction + mask)]
     while following != END:
-        state = following
-        pixel += steps[state]
-        pixels[length] = pixel
-        codes[length] = marks[pixel] & CODE
-        marks[pixel] = TAKEN
+        pixel += following >> STATE_BITS
+        state = following & END
+        index, place = np.uint64(pixel), np.uint64(length)
+        pixels[place] = pixel
+        codes[place] = marks[index] & CODE
+        marks[index] = TAKEN
         length += 1
         mask = open_neighbours(marks, pixel, stride)
-        following = table[state, mask]
-        if (mask & (mask - 1)) != 0 or (following == END and mask != 0):
-            stack[top] = pixel
-            top += 1
+        following = moves[np.uint64(256 * state + mask)]
+        stack[np.uint64(top)] = pixel
+        top += ((mask & (mask - 1)) != 0) | ((following == END) & (mask != 0))
     return length, top
 
 
 @inlined
 def open_neighbours(marks: Any, pixel: int, stride: int) -> int:
-    """The mask of a pixel: bit d is set where the neighbour in direction d is a candidate that no chain has yet.
+    """The mask of a pixel: bit d is set where the neighbour in direction d is OPEN.
 
     Indices are unsigned, for which Numba leaves out the test whether to count from the end.
     """
     middle, row, one = np.uint64(pixel), np.uint64(stride), np.uint64(1)
     above, below = middle - row, middle + row
-    return (is_open(marks[middle + one]) | is_open(marks[below + one]) << 1 | is_open(marks[below]) << 2
-            | is_open(marks[below - one]) << 3 | is_open(marks[middle - one]) << 4 | is_open(marks[above - one]) << 5
-            | is_open(marks[above]) << 6 | is_open(marks[above + one]) << 7)
+    return (opening(marks[middle + one], 0) | opening(marks[below + one], 1) | opening(marks[below], 2)
+            | opening(marks[below - one], 3) | opening(marks[middle - one], 4) | opening(marks[above - one], 5)
+            | opening(marks[above], 6) | opening(marks[above + one], 7))
 
 
 @inlined
-def is_open(mark: int) -> Any:
-    """1 for the mark of a candidate that no chain has yet, 0 for any other."""
-    return np.int64((mark & CANDIDATE) != 0)
+def opening(mark: int, direction: int) -> Any:
+    """The bit of a direction where a mark is OPEN, else 0."""
+    return np.int64(mark & OPEN) >> 7 - direction
 
 
 @inlined
