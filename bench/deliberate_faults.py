@@ -31,7 +31,8 @@ FAULTS = {
     ],
     'buffers': [
         ('size + size // 4', 'size - size // 4'),
-        ('array.shape != (height, width)', 'array.size < height * width'),
+        ('image.shape != (height, width)', 'image.size < height * width'),
+        ('            image.fill(0)', '            pass'),
     ],
     'compiling': [
         ("glob('*.py')", "glob('c*.py')"),
@@ -123,8 +124,11 @@ FAULTS = {
     'scanning': [
         ('back = -1 if right else 1', 'back = 1 if right else -1'),
         ('offsets[before:count + 1]', 'offsets[before + 1:count + 1]'),
-        ('(mask & (mask - 1)) != 0 or ', ''),
-        ('direction = (code + 1) % 4', 'direction = (code + 1) % 5'),
+        ('((mask & (mask - 1)) != 0) | ', ''),
+        ('| ((following == END) & (mask != 0))', ''),
+        ('direction = (np.int64(code) + 1) % 4', 'direction = (np.int64(code) + 1) % 5'),
+        ('(marks, beside, stride) >> direction', '(marks, beside, stride)'),
+        ('np.int64(mark & OPEN) >> 7 - direction', 'np.int64(mark & OPEN) >> 6 - direction'),
         ('(2 * span_y * k + steps)', '(2 * span_y * k)'),
         ('and between != 2', 'and between != 3'),
         ('0 <= pixel % stride + step < stride', '0 <= pixel % stride + step'),

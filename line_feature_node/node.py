@@ -34,7 +34,7 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import ImageMarker
 
-from line_feature_node.core import LineFeatureExtractor
+from line_feature_node.core import LineFeatureExtractor, warm_up_all
 from line_feature_node.files import read_mask
 from line_feature_node.images import compressed_image_of, displayable, image_of, range_hint, usable_pixels
 from line_feature_node.messages import Messages
@@ -232,7 +232,7 @@ class LineFeatureNode(LifecycleNode):
     def _configure(self) -> None:
         options = self._settings.options
         self._mask = read_mask(Path(options.mask_file)) if options.mask_file else None
-        warm_up(self._extractor, self.get_logger())
+        load_kernels(self._extractor.warm_up, self.get_logger())
         for topic, kind in OUTPUTS.items():
             self._publishers_of[topic] = self.create_publisher(
                 kind, topic, QoSProfile(depth=OUTPUT_DEPTH), qos_overriding_options=QoSOverridingOptions(POLICIES),
@@ -490,11 +490,11 @@ def run(args: list[str], ready: Callable[[], None]) -> int:
     return 0
 
 
-def warm_up(extractor: LineFeatureExtractor, logger: Any) -> None:
+def load_kernels(warm_up: Callable[[], None], logger: Any) -> None:
     """Compile the kernels, or load them."""
-    logger.info('loading the kernels; the first time they are compiled, which takes 15 to 30 s')
+    logger.info('loading the kernels; the first time they are compiled, which takes up to a minute')
     begin = time.monotonic()
-    extractor.warm_up()
+    warm_up()
     logger.info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
 
 
@@ -533,6 +533,7 @@ def _started(args: list[str]) -> LineFeatureNode:
     unknown = remove_ros_args(args)[1:]
     if unknown:
         raise ConfigurationError(f'unknown argument {unknown[0]!r}: parameters stand behind --ros-args')
-    # Before there is a node: a signal may end the process at once meanwhile, and nobody waits for an answer.
-    warm_up(LineFeatureExtractor(), get_logger('line_feature_node'))
+    # Before there is a node: a signal may end the process at once meanwhile, and nobody waits for an answer. And all of
+    # them: a change of parameters would hold the node up for long if it had any to compile.
+    load_kernels(warm_up_all, get_logger('line_feature_node'))
     return LineFeatureNode()

@@ -1,5 +1,7 @@
 import dataclasses
 import math
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -560,6 +562,40 @@ def test_warm_up_is_for_all_threads() -> None:
     assert warm['smooth_down'] >= max(before['smooth_down'], 1)
     extractor.extract(wide(720, 1280, 4, np.uint16))
     assert signatures() == warm
+
+
+CHANGING = """
+import importlib, itertools, pkgutil
+import numpy as np
+from line_feature_node import core
+
+names = [found.name for found in pkgutil.iter_modules(core.__path__)]
+modules = [importlib.import_module(f'line_feature_node.core.{name}') for name in names]
+kernels = [value for module in modules for value in vars(module).values() if hasattr(value, 'signatures')]
+assert len(kernels) > 50
+core.warm_up_all()
+before = [len(kernel.signatures) for kernel in kernels]
+names = ('operator', 'thinning', 'grouping', 'refine', 'orientation', 'n', 'threads')
+values = (('deriche', 'sobel', 'dog'), ('suppression', 'morphological', 'none'), ('codes', 'straightness'),
+          (True, False), ('principal_axis', 'least_squares'), (0, 4), (1, 2))
+picture = np.zeros((736, 736), np.uint8)
+picture[90:400, 90:400] = 200
+for some in itertools.product(*values):
+    parameters = core.Parameters(**dict(zip(names, some)))
+    if parameters.threads > 1 and (parameters.orientation, parameters.n) != ('principal_axis', 4):
+        continue  # large pictures take long
+    seen = picture if parameters.threads > 1 else picture[60:140, 60:160]
+    for kind in (np.uint8, np.uint16, np.float32):
+        core.LineFeatureExtractor(parameters).extract(seen.astype(kind), np.ones(seen.shape, bool))
+print([kernel for kernel, count in zip(kernels, before) if len(kernel.signatures) > count])
+"""
+
+
+@pytest.mark.compiled
+def test_no_parameters_need_kernels_that_warm_up_all_has_not() -> None:
+    """In a process of its own, where no other test had any compiled."""
+    done = subprocess.run([sys.executable, '-c', CHANGING], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ('[]\n', '')
 
 
 def signatures() -> dict[str, int]:

@@ -15,7 +15,7 @@ from line_feature_node.core.parameters import Parameters
 
 #: The noise is measured in this many rows, or a few more, and in one of at least so many; in this many columns, or up
 #: to twice as many.
-ROWS, EVERY, COLUMNS = 30, 16, 640
+ROWS, EVERY, COLUMNS = 30, 16, 320
 #: Bins of the histogram that the median is taken from, and how many there are to a grey level.
 BINS, RESOLUTION = 4096, 4
 #: The median of |x| of a normal distribution, in standard deviations.

@@ -45,6 +45,8 @@ LEAST_SHARED = 2**19
 PARTS = 8
 #: Pixels an image may have: positions are 32-bit numbers.
 MOST_PIXELS = 2**30
+#: Parameters that between them use all kernels.
+ALL_KERNELS = (Parameters(), Parameters.paper(), Parameters(threads=2), Parameters(operator='sobel'))
 
 
 @dataclass(frozen=True)
@@ -272,6 +274,12 @@ class LineFeatureExtractor:
         if not view.whole:
             segments = placed(segments, view.x, view.y, view.across, view.down)
         return selected(segments, p)
+
+
+def warm_up_all() -> None:
+    """As :meth:`LineFeatureExtractor.warm_up`, for whatever parameters and types of pixels there will be."""
+    for parameters in ALL_KERNELS:
+        LineFeatureExtractor(parameters).warm_up()
 
 
 def lines_of_edges(

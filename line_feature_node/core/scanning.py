@@ -238,7 +238,7 @@ def next_start(
         if top == 0:
             return -1, beside, direction, top
         top -= 1
-        beside, direction = np.int64(stack[top]), 0
+        beside, direction = int(stack[top]), 0
 
 
 @inlined

@@ -108,10 +108,11 @@ def sum_up(first: int, size: int, pixels: Any, bridged: Any, stride: int, margin
     for k in range(size):
         if k % UNIT == 0:
             put_down(sums, k // UNIT, n, sx, sy, sxx, sxy, syy)
+        if bridged[first + k]:
+            continue
         row, column = position(pixels[first + k], inverse, stride)
-        counts = 0 if bridged[first + k] else 1
-        x, y = counts * (column - margin), counts * (row - margin)
-        n, sx, sy, sxx, sxy, syy = n + counts, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
+        x, y = column - margin, row - margin
+        n, sx, sy, sxx, sxy, syy = n + 1, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
     put_down(sums, (size + UNIT - 1) // UNIT, n, sx, sy, sxx, sxy, syy)
 
 
