@@ -124,8 +124,7 @@ FAULTS = {
     'scanning': [
         ('back = -1 if right else 1', 'back = 1 if right else -1'),
         ('offsets[before:count + 1]', 'offsets[before + 1:count + 1]'),
-        ('((mask & (mask - 1)) != 0) | ', ''),
-        ('| ((following == END) & (mask != 0))', ''),
+        ('(mask & (mask - 1)) != 0', 'mask > 128'),
         ('direction = (np.int64(code) + 1) % 4', 'direction = (np.int64(code) + 1) % 5'),
         ('(marks, beside, stride) >> direction', '(marks, beside, stride)'),
         ('np.int64(mark & OPEN) >> 7 - direction', 'np.int64(mark & OPEN) >> 6 - direction'),

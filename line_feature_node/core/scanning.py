@@ -278,7 +278,8 @@ def walk(
     """Append the pixels that follow the start in a direction, and put those beside which others stay on the stack.
 
     Every pixel is written on top of the stack, and most are not kept there: to ask before would be a branch that no
-    processor can predict.
+    processor can predict. One neighbour alone is where the chain goes on; if it lies back too sharply for that, it is
+    a neighbour of the pixel before, too, which is on the stack then.
 
     Args:
         mask: The neighbours of the start.
@@ -296,7 +297,7 @@ def walk(
         mask = open_neighbours(marks, pixel, stride)
         following = moves[np.uint64(256 * state + mask)]
         stack[np.uint64(top)] = pixel
-        top += ((mask & (mask - 1)) != 0) | ((following == END) & (mask != 0))
+        top += (mask & (mask - 1)) != 0
     return length, top
 
 
