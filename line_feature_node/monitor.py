@@ -16,6 +16,9 @@ from line_feature_node.options import Options
 WINDOW, AGE = 1000, 5.0
 #: A jump of the sequence number by more is a publisher that began anew, not a loss.
 LARGEST_JUMP = 10000
+#: A publisher that was silent for so many seconds is likely to be dead, where another that was not may have sent the
+#: frame: one whose latest number is at most so much lower.
+SILENT, NEAR = 1.0, 100
 
 
 class Level(IntEnum):
@@ -92,28 +95,36 @@ class Gaps:
     """Tells by publication sequence numbers how many frames never came, of one publisher or of several.
 
     Who published a frame is not known. Its number goes on with the nearest lower one of the latest of each publisher;
-    taking a publisher for another so makes no difference to the sum.
+    taking a publisher for another so makes no difference to the sum, if both go on. So one that is likely to be dead is
+    left out, where it can be.
     """
 
     def __init__(self) -> None:
-        self._latest: list[int] = []  # of each publisher, in the order in which they came
+        self._latest: list[tuple[int, float]] = []  # number and time of each publisher, in the order in which they came
 
-    def missed(self, number: int, publishers: int) -> int:
+    def missed(self, number: int, publishers: int, now: float) -> int:
         """How many frames are missing before this one.
 
         Args:
             number: Its sequence number.
             publishers: How many there are. One that was killed is among them for 20 s, until its lease ends.
+            now: When it came, in seconds.
         """
         missed = 0
-        before = max((latest for latest in self._latest if 0 < number - latest <= LARGEST_JUMP), default=None)
+        before = self._before(number, now)
         # Beyond a gap it may be the first frame of a publisher of which none came yet.
-        if before is not None and (number == before + 1 or len(self._latest) >= publishers):
+        if before is not None and (number == before[0] + 1 or len(self._latest) >= publishers):
             self._latest.remove(before)
-            missed = number - before - 1
-        self._latest.append(number)
+            missed = number - before[0] - 1
+        self._latest.append((number, now))
         del self._latest[:-max(publishers, 1)]
         return missed
+
+    def _before(self, number: int, now: float) -> tuple[int, float] | None:
+        """What a frame goes on with; None where it is the first of a publisher."""
+        lower = [latest for latest in self._latest if 0 < number - latest[0] <= LARGEST_JUMP]
+        alive = [(latest, when) for latest, when in lower if now - when < SILENT and number - latest <= NEAR]
+        return max(alive or lower, default=None)
 
 
 @dataclass
@@ -153,7 +164,7 @@ class Monitor:
         self.counts.received += 1
         self._last_image = self.clock()
         if sequence is not None:
-            self.counts.dropped += self._gaps.missed(sequence, publishers)
+            self.counts.dropped += self._gaps.missed(sequence, publishers, self._last_image)
 
     def process(self, latency: float, times: Mapping[str, float], segments: int) -> None:
         """Count a frame that gave segments.

@@ -174,10 +174,11 @@ def sum_up(
         n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
         for place in range(offsets[label], offsets[label + 1]):
             k = members[place]
+            if bridged[k]:
+                continue
             row, column = position(pixels[k], inverse, stride)
-            counts = 0 if bridged[k] else 1
-            x, y = counts * (column - margin), counts * (row - margin)
-            n, sx, sy, sxx, sxy, syy = n + counts, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
+            x, y = column - margin, row - margin
+            n, sx, sy, sxx, sxy, syy = n + 1, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
         put_down(moments, label, n, sx, sy, sxx, sxy, syy)
 
 
