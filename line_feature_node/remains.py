@@ -14,6 +14,7 @@ import shutil
 import sqlite3
 import struct
 import zlib
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -366,29 +367,56 @@ def _rows(path: Path, options: str, damage: list[str], name: str = '') -> Iterat
         # Or a file that is shorter than it says is not read at all.
         database.execute('PRAGMA writable_schema = ON')
         channels = _topics(database, name, damage)
-        last, step = -1, 0
-        while step < LARGEST_STEP:
-            errors: list[str] = []
-            for number, topic, stamp, data in _rows_behind(database, last + step, errors):
-                last, step = number, 0
-                if not isinstance(stamp, int) or stamp < 0:
-                    damage.append(f'{name} has a stamp that makes no sense in row {number}')
-                elif topic in channels and isinstance(data, bytes):
-                    yield Message(channels[topic], stamp, _inflated(data))
-            if not errors:
-                return
-            if not step:
-                damage.append(f'{name}: {errors[0]} after row {last}')
-            step = 2 * step or 1
+        had, starts = _Numbers(), [-1]
+        while starts:
+            start, step, errors = starts.pop(), 0, ['']
+            fresh: list[int] = []
+            while errors and not fresh and step < LARGEST_STEP:
+                errors = []
+                for number, topic, stamp, data in _rows_behind(database, start + step, errors):
+                    # Where numbers are damaged, too, rows come that were had before, and would for ever.
+                    if not isinstance(number, int) or not had.add(number):
+                        continue
+                    fresh = [*fresh[-1:], number]
+                    if not isinstance(stamp, int) or stamp < 0:
+                        damage.append(f'{name} has a stamp that makes no sense in row {number}')
+                    elif topic in channels and isinstance(data, bytes):
+                        yield Message(channels[topic], stamp, _inflated(data))
+                if errors and (fresh or step == 0 > start):
+                    damage.append(f'{name}: {errors[0]} after row {[start, *fresh][-1]}')
+                step = 2 * step or 1
+            if errors and fresh:
+                # A number that does not follow the one before may be a damaged one.
+                starts += fresh[-1:] if fresh[-1] == fresh[0] + 1 else fresh
     except sqlite3.Error as error:
         damage.append(f'{name}: {" ".join(str(error).split())}')
     finally:
         database.close()
 
 
+class _Numbers:
+    """Whole numbers, kept as ranges, as most follow each other."""
+
+    def __init__(self) -> None:
+        self._starts: list[int] = []
+        self._ends: list[int] = []
+
+    def add(self, number: int) -> bool:
+        """Whether it was not there before."""
+        k = bisect_right(self._starts, number)
+        if k and number < self._ends[k - 1]:
+            return False
+        if k and number == self._ends[k - 1]:
+            self._ends[k - 1] += 1
+        else:
+            self._starts.insert(k, number)
+            self._ends.insert(k, number + 1)
+        return True
+
+
 def _rows_behind(
     database: sqlite3.Connection, number: int, errors: list[str],
-) -> Iterator[tuple[int, int, int, object]]:
+) -> Iterator[tuple[object, int, int, object]]:
     """Rows with larger numbers, up to one that cannot be read."""
     try:
         yield from database.execute(

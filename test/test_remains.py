@@ -327,6 +327,41 @@ def test_rows_of_old_recordings_have_no_definitions(tmp_path):
     assert (stamp, found) == (5, data)
 
 
+@pytest.mark.parametrize('place', range(4))
+@pytest.mark.parametrize('number', [3, 120])
+def test_rows_in_a_wrong_order_remain_once_each(tmp_path, place, number):
+    """One of the four rows of a page has the number of another place, and the page behind it is damaged.
+
+    So that is gone on behind, at rows that were had before.
+    """
+    path = tmp_path / 'rec.db3'
+    database = sqlite3.connect(path)
+    database.executescript("""
+        PRAGMA page_size = 4096;
+        CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+        CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+        INSERT INTO topics VALUES (1, '/words', 'std_msgs/msg/String', 'cdr');""")
+    stamps = range(1, 101)
+    database.executemany('INSERT INTO messages VALUES (?, 1, ?, ?)', [(k, k, bytes(900)) for k in stamps])
+    database.commit()
+    database.close()
+    data = bytearray(path.read_bytes())
+    leaves = [start for start in range(0, len(data), 4096) if data[start] == 13 and data[start + 4] == 4]
+    page = leaves[len(leaves) // 2]
+    cells = [page + int.from_bytes(data[page + k:page + k + 2], 'big') for k in (8, 10, 12, 14)]
+    first = data[cells[0] + 2]  # behind the size of the row, two bytes
+    assert [data[cell + 2] for cell in cells] == list(range(first, first + 4))
+    data[cells[place] + 2] = number
+    behind = leaves[len(leaves) // 2 + 1]
+    data[behind:behind + 4096] = b'\xff' * 4096
+    path.write_bytes(data)
+    damage = []
+    found = [stamp for _, stamp, _ in remains(path, tmp_path, damage)]
+    assert len(set(found)) == len(found)
+    assert set(stamps) - set(range(first, first + 16)) <= set(found)
+    assert damage
+
+
 @pytest.mark.parametrize('content', [b'', b'hello', b'version https://git-lfs.github.com/spec/v1', bytes(5000)])
 def test_what_is_no_recording_has_no_remains(tmp_path, content):
     (tmp_path / 'rec.bag').write_bytes(content)
