@@ -1,5 +1,6 @@
 """What the node knows of its own health: counters, times, and the verdict on them."""
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
@@ -16,9 +17,9 @@ from line_feature_node.options import Options
 WINDOW, AGE = 1000, 5.0
 #: A jump of the sequence number by more is a publisher that began anew, not a loss.
 LARGEST_JUMP = 10000
-#: A publisher that was silent for so many seconds is likely to be dead, where another that was not may have sent the
-#: frame: one whose latest number is at most so much lower.
-SILENT, NEAR = 1.0, 100
+#: A publisher is likely to be dead when so many frames came since its last one, and so many times as many as between
+#: that and the one before; where another, whose latest number is at most so much lower, may have sent the frame.
+SILENT, TIMES, NEAR = 30, 3, 30
 
 
 class Level(IntEnum):
@@ -91,6 +92,20 @@ class Counts:
     failed: int = 0
 
 
+class Latest(NamedTuple):
+    """The latest frame of a publisher.
+
+    Attributes:
+        number: Its sequence number.
+        count: How many frames had come by then, of all publishers.
+        every: How many came between it and the one before.
+    """
+
+    number: int
+    count: int
+    every: float = math.inf
+
+
 class Gaps:
     """Tells by publication sequence numbers how many frames never came, of one publisher or of several.
 
@@ -100,30 +115,33 @@ class Gaps:
     """
 
     def __init__(self) -> None:
-        self._latest: list[tuple[int, float]] = []  # number and time of each publisher, in the order in which they came
+        self._latest: list[Latest] = []  # of each publisher, in the order in which they came
+        self._count = 0
 
-    def missed(self, number: int, publishers: int, now: float) -> int:
+    def missed(self, number: int, publishers: int) -> int:
         """How many frames are missing before this one.
 
         Args:
             number: Its sequence number.
             publishers: How many there are. One that was killed is among them for 20 s, until its lease ends.
-            now: When it came, in seconds.
         """
-        missed = 0
-        before = self._before(number, now)
+        self._count += 1
+        missed, latest = 0, Latest(number, self._count)
+        before = self._before(number)
         # Beyond a gap it may be the first frame of a publisher of which none came yet.
-        if before is not None and (number == before[0] + 1 or len(self._latest) >= publishers):
+        if before is not None and (number == before.number + 1 or len(self._latest) >= publishers):
             self._latest.remove(before)
-            missed = number - before[0] - 1
-        self._latest.append((number, now))
+            missed = number - before.number - 1
+            latest = latest._replace(every=self._count - before.count)
+        self._latest.append(latest)
         del self._latest[:-max(publishers, 1)]
         return missed
 
-    def _before(self, number: int, now: float) -> tuple[int, float] | None:
+    def _before(self, number: int) -> Latest | None:
         """What a frame goes on with; None where it is the first of a publisher."""
-        lower = [latest for latest in self._latest if 0 < number - latest[0] <= LARGEST_JUMP]
-        alive = [(latest, when) for latest, when in lower if now - when < SILENT and number - latest <= NEAR]
+        lower = [latest for latest in self._latest if 0 < number - latest.number <= LARGEST_JUMP]
+        alive = [latest for latest in lower if number - latest.number <= NEAR
+                 and self._count - latest.count <= max(SILENT, TIMES * latest.every)]
         return max(alive or lower, default=None)
 
 
@@ -164,7 +182,7 @@ class Monitor:
         self.counts.received += 1
         self._last_image = self.clock()
         if sequence is not None:
-            self.counts.dropped += self._gaps.missed(sequence, publishers, self._last_image)
+            self.counts.dropped += self._gaps.missed(sequence, publishers)
 
     def process(self, latency: float, times: Mapping[str, float], segments: int) -> None:
         """Count a frame that gave segments.

@@ -44,6 +44,8 @@ READ_ONLY = 'mode=ro&immutable=1'
 NONSENSE = (McapError, MemoryError, OverflowError, ValueError, struct.error)
 #: Rows that cannot be read are skipped in steps that double, up to this.
 LARGEST_STEP = 2**24
+#: The largest number of a row.
+LARGEST_ROW = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -371,17 +373,23 @@ def _rows(path: Path, options: str, damage: list[str], name: str = '') -> Iterat
         while starts:
             start, step, errors = starts.pop(), 0, ['']
             fresh: list[int] = []
-            while errors and not fresh and step < LARGEST_STEP:
-                errors = []
+            while errors and not fresh and step < LARGEST_STEP and start + step <= LARGEST_ROW:
+                errors, found, again = [], _Numbers(), 0
                 for number, topic, stamp, data in _rows_behind(database, start + step, errors):
                     # Where numbers are damaged, too, rows come that were had before, and would for ever.
-                    if not isinstance(number, int) or not had.add(number):
+                    known = not isinstance(number, int) or number in had
+                    again += known or not found.add(number)
+                    if again > had.count + found.count:
+                        errors.append('rows come again and again')
+                        break
+                    if known:
                         continue
                     fresh = [*fresh[-1:], number]
                     if not isinstance(stamp, int) or stamp < 0:
                         damage.append(f'{name} has a stamp that makes no sense in row {number}')
                     elif topic in channels and isinstance(data, bytes):
                         yield Message(channels[topic], stamp, _inflated(data))
+                had.update(found)
                 if errors and (fresh or step == 0 > start):
                     damage.append(f'{name}: {errors[0]} after row {[start, *fresh][-1]}')
                 step = 2 * step or 1
@@ -395,22 +403,41 @@ def _rows(path: Path, options: str, damage: list[str], name: str = '') -> Iterat
 
 
 class _Numbers:
-    """Whole numbers, kept as ranges, as most follow each other."""
+    """Whole numbers, kept as ranges, as most follow each other.
+
+    Attributes:
+        count: How many there are.
+        starts, ends: The first of each range, and what is behind its last.
+    """
 
     def __init__(self) -> None:
-        self._starts: list[int] = []
-        self._ends: list[int] = []
+        self.count = 0
+        self.starts: list[int] = []
+        self.ends: list[int] = []
+
+    def __contains__(self, number: int) -> bool:
+        k = bisect_right(self.starts, number)
+        return k > 0 and number < self.ends[k - 1]
 
     def add(self, number: int) -> bool:
         """Whether it was not there before."""
-        k = bisect_right(self._starts, number)
-        if k and number < self._ends[k - 1]:
+        return self._add(number, number + 1)
+
+    def update(self, others: '_Numbers') -> None:
+        """Add others, none of which is there."""
+        for start, end in zip(others.starts, others.ends, strict=True):
+            self._add(start, end)
+
+    def _add(self, start: int, end: int) -> bool:
+        k = bisect_right(self.starts, start)
+        if k and start < self.ends[k - 1]:
             return False
-        if k and number == self._ends[k - 1]:
-            self._ends[k - 1] += 1
+        if k and start == self.ends[k - 1]:
+            self.ends[k - 1] = end
         else:
-            self._starts.insert(k, number)
-            self._ends.insert(k, number + 1)
+            self.starts.insert(k, start)
+            self.ends.insert(k, end)
+        self.count += end - start
         return True
 
 

@@ -27,7 +27,7 @@ def test_an_image_has_exactly_its_size():
 
 
 def test_images_of_several_sizes_share_memory_and_begin_as_zeros():
-    """A camera that is switched to and fro takes no more than its largest picture."""
+    """A camera that is switched to and fro takes no more than with its largest picture alone."""
     buffers = Buffers()
     largest = buffers.image('a', 40, 50, np.float32)
     for height, width, dtype in [(30, 20, np.float32), (40, 50, np.int16), (40, 50, np.float32)]:

@@ -603,6 +603,17 @@ def signatures() -> dict[str, int]:
     return {name: len(value.signatures) for name, value in vars(edges).items() if hasattr(value, 'signatures')}
 
 
+def test_edges_stay_those_of_the_last_frame_that_was_extracted() -> None:
+    """Another is refused, whose size is another: its memory is the same."""
+    extractor = LineFeatureExtractor(Parameters.profile('paper', intensity_min=300.0))
+    extractor.extract(wide(40, 48, 4, np.uint16))
+    before = extractor.edges()
+    assert before.any()
+    with pytest.raises(ValueError, match='intensity_min must be less'):
+        extractor.extract(np.zeros((24, 32), np.uint8))
+    np.testing.assert_array_equal(extractor.edges(), before)
+
+
 def test_small_pictures_have_one_thread() -> None:
     before = set(threading.enumerate())
     extractor = LineFeatureExtractor(Parameters(threads=4))

@@ -327,6 +327,49 @@ def test_rows_of_old_recordings_have_no_definitions(tmp_path):
     assert (stamp, found) == (5, data)
 
 
+def table(path, numbers, size):
+    """A recording of sqlite3 with rows of numbers, which are their stamps, too; its bytes."""
+    database = sqlite3.connect(path)
+    database.executescript("""
+        PRAGMA page_size = 4096;
+        CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+        CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+        INSERT INTO topics VALUES (1, '/words', 'std_msgs/msg/String', 'cdr');""")
+    database.executemany('INSERT INTO messages VALUES (?, 1, ?, ?)', [(k, k, bytes(size)) for k in numbers])
+    database.commit()
+    database.close()
+    return bytearray(path.read_bytes())
+
+
+def leaves_of(data):
+    """Where the pages of four rows begin, and where the numbers of these are."""
+    starts = [start for start in range(0, len(data), 4096) if data[start] == 13 and data[start + 4] == 4]
+    return [(start, [start + int.from_bytes(data[start + k:start + k + 2], 'big') + 2 for k in (8, 10, 12, 14)])
+            for start in starts]
+
+
+@pytest.mark.parametrize('bit', range(7))
+def test_a_row_with_the_number_of_another_costs_neither(tmp_path, bit):
+    path = tmp_path / 'rec.db3'
+    data = table(path, range(1, 101), 900)
+    _, cells = leaves_of(data)[5]
+    data[cells[1]] ^= 1 << bit
+    path.write_bytes(data)
+    assert [stamp for _, stamp, _ in remains(path, tmp_path, [])] == list(range(1, 101))
+
+
+def test_rows_of_the_largest_numbers_remain(tmp_path):
+    """What is behind them has no number."""
+    path = tmp_path / 'rec.db3'
+    data = table(path, range(2**63 - 60, 2**63), 900)
+    last = max(start for start in range(0, len(data), 4096) if data[start] == 13)
+    data[last:] = b'\xff' * (len(data) - last)
+    path.write_bytes(data)
+    damage = []
+    assert len(list(remains(path, tmp_path, damage))) > 40
+    assert damage
+
+
 @pytest.mark.parametrize('place', range(4))
 @pytest.mark.parametrize('number', [3, 120])
 def test_rows_in_a_wrong_order_remain_once_each(tmp_path, place, number):
@@ -334,25 +377,14 @@ def test_rows_in_a_wrong_order_remain_once_each(tmp_path, place, number):
 
     So that is gone on behind, at rows that were had before.
     """
-    path = tmp_path / 'rec.db3'
-    database = sqlite3.connect(path)
-    database.executescript("""
-        PRAGMA page_size = 4096;
-        CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
-        CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
-        INSERT INTO topics VALUES (1, '/words', 'std_msgs/msg/String', 'cdr');""")
-    stamps = range(1, 101)
-    database.executemany('INSERT INTO messages VALUES (?, 1, ?, ?)', [(k, k, bytes(900)) for k in stamps])
-    database.commit()
-    database.close()
-    data = bytearray(path.read_bytes())
-    leaves = [start for start in range(0, len(data), 4096) if data[start] == 13 and data[start + 4] == 4]
-    page = leaves[len(leaves) // 2]
-    cells = [page + int.from_bytes(data[page + k:page + k + 2], 'big') for k in (8, 10, 12, 14)]
-    first = data[cells[0] + 2]  # behind the size of the row, two bytes
-    assert [data[cell + 2] for cell in cells] == list(range(first, first + 4))
-    data[cells[place] + 2] = number
-    behind = leaves[len(leaves) // 2 + 1]
+    path, stamps = tmp_path / 'rec.db3', range(1, 101)
+    data = table(path, stamps, 900)
+    leaves = leaves_of(data)
+    _, cells = leaves[len(leaves) // 2]
+    first = data[cells[0]]
+    assert [data[cell] for cell in cells] == list(range(first, first + 4))
+    data[cells[place]] = number
+    behind, _ = leaves[len(leaves) // 2 + 1]
     data[behind:behind + 4096] = b'\xff' * 4096
     path.write_bytes(data)
     damage = []

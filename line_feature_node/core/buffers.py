@@ -7,7 +7,7 @@ from numpy.typing import DTypeLike, NDArray
 
 
 class Buffers:
-    """Arrays by name, in as much memory as the largest frame so far needed.
+    """Arrays by name, in as much memory as the largest frame so far needed, and a quarter for somewhat larger ones.
 
     What an array holds at first is unspecified, but for those asked for with ``zeros``: their users leave them as
     they found them, all zero.

@@ -71,6 +71,8 @@ def extract_edges(
         and exceeds T2, with STRONG where it exceeds T1, and 0 elsewhere; padded by MARGIN on each side, and at the
         right to a multiple of eight columns.
     """
+    # Before anything of the last frame is written over: it may raise.
+    scale, offset = intensity_map(image.dtype, parameters)
     height, width = image.shape
     # Whole strips of rows and whole tiles of columns fit in, with the padding.
     lines, columns = -(-height // LANES) * LANES, -(-(width + 2 * PAD) // TILE) * TILE
@@ -81,7 +83,6 @@ def extract_edges(
     marks = buffers.image('marks', height + 2 * MARGIN, -(-(width + 2 * MARGIN) // 8) * 8, np.uint8)
     # An image of another width may have had the same padded one, and pixels where the padding is now.
     marks[:, MARGIN + width:] = 0
-    scale, offset = intensity_map(image.dtype, parameters)
     q = math.exp(-parameters.alpha)
     recursive = parameters.operator == 'deriche'
     if recursive:

@@ -279,7 +279,7 @@ def walk(
 
     Every pixel is written on top of the stack, and most are not kept there: to ask before would be a branch that no
     processor can predict. One neighbour alone is where the chain goes on; if it lies back too sharply for that, it is
-    a neighbour of the pixel before, too, which is on the stack then.
+    a neighbour of the pixel before, too, which is on the stack then, or, if it is the start, is put there in the end.
 
     Args:
         mask: The neighbours of the start.
