@@ -97,12 +97,12 @@ class Latest(NamedTuple):
 
     Attributes:
         number: Its sequence number.
-        count: How many frames had come by then, of all publishers.
+        place: How many frames had come by then, of all publishers.
         every: How many came between it and the one before.
     """
 
     number: int
-    count: int
+    place: int
     every: float = math.inf
 
 
@@ -132,7 +132,7 @@ class Gaps:
         if before is not None and (number == before.number + 1 or len(self._latest) >= publishers):
             self._latest.remove(before)
             missed = number - before.number - 1
-            latest = latest._replace(every=self._count - before.count)
+            latest = latest._replace(every=self._count - before.place)
         self._latest.append(latest)
         del self._latest[:-max(publishers, 1)]
         return missed
@@ -141,7 +141,7 @@ class Gaps:
         """What a frame goes on with; None where it is the first of a publisher."""
         lower = [latest for latest in self._latest if 0 < number - latest.number <= LARGEST_JUMP]
         alive = [latest for latest in lower if number - latest.number <= NEAR
-                 and self._count - latest.count <= max(SILENT, TIMES * latest.every)]
+                 and self._count - latest.place <= max(SILENT, TIMES * latest.every)]
         return max(alive or lower, default=None)
 
 

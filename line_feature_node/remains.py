@@ -376,8 +376,10 @@ def _rows(path: Path, options: str, damage: list[str], name: str = '') -> Iterat
             while errors and not fresh and step < LARGEST_STEP and start + step <= LARGEST_ROW:
                 errors, found, again = [], _Numbers(), 0
                 for number, topic, stamp, data in _rows_behind(database, start + step, errors):
+                    if not isinstance(number, int):
+                        continue
                     # Where numbers are damaged, too, rows come that were had before, and would for ever.
-                    known = not isinstance(number, int) or number in had
+                    known = number in had
                     again += known or not found.add(number)
                     if again > had.count + found.count:
                         errors.append('rows come again and again')
