@@ -17,8 +17,8 @@ from line_feature_node.options import Options
 WINDOW, AGE = 1000, 5.0
 #: A jump of the sequence number by more is a publisher that began anew, not a loss.
 LARGEST_JUMP = 10000
-#: A publisher is likely to be dead when so many frames came since its last one, and so many times as many as between
-#: that and the one before; where another, whose latest number is at most so much lower, may have sent the frame.
+#: A publisher may be dead when so many frames came since its last one, and so many times as many as between that and
+#: the one before; and another, whose latest number is at most so much lower, may have sent what seems to go on with it.
 SILENT, TIMES, NEAR = 30, 3, 30
 
 
@@ -99,19 +99,21 @@ class Latest(NamedTuple):
         number: Its sequence number.
         place: How many frames had come by then, of all publishers.
         every: How many came between it and the one before.
+        owed: How many more frames are missing if its publisher is gone.
     """
 
     number: int
     place: int
     every: float = math.inf
+    owed: int = 0
 
 
 class Gaps:
     """Tells by publication sequence numbers how many frames never came, of one publisher or of several.
 
     Who published a frame is not known. Its number goes on with the nearest lower one of the latest of each publisher;
-    taking a publisher for another so makes no difference to the sum, if both go on. So one that is likely to be dead is
-    left out, where it can be.
+    taking a publisher for another so makes no difference to the sum, if both go on. Where one of them was dead, what is
+    missing then is counted when it is forgotten.
     """
 
     def __init__(self) -> None:
@@ -127,22 +129,32 @@ class Gaps:
         """
         self._count += 1
         missed, latest = 0, Latest(number, self._count)
-        before = self._before(number)
+        before = max(self._lower(number, LARGEST_JUMP), default=None)
         # Beyond a gap it may be the first frame of a publisher of which none came yet.
         if before is not None and (number == before.number + 1 or len(self._latest) >= publishers):
             self._latest.remove(before)
             missed = number - before.number - 1
             latest = latest._replace(every=self._count - before.place)
+            if self._is_silent(before):
+                self._owe(number, before)
         self._latest.append(latest)
-        del self._latest[:-max(publishers, 1)]
-        return missed
+        gone = self._latest[:-max(publishers, 1)]
+        del self._latest[:len(gone)]
+        return missed + sum(other.owed for other in gone)
 
-    def _before(self, number: int) -> Latest | None:
-        """What a frame goes on with; None where it is the first of a publisher."""
-        lower = [latest for latest in self._latest if 0 < number - latest.number <= LARGEST_JUMP]
-        alive = [latest for latest in lower if number - latest.number <= NEAR
-                 and self._count - latest.place <= max(SILENT, TIMES * latest.every)]
-        return max(alive or lower, default=None)
+    def _lower(self, number: int, most: int) -> list[Latest]:
+        """Those of which a number is no more than so much higher."""
+        return [latest for latest in self._latest if 0 < number - latest.number <= most]
+
+    def _is_silent(self, latest: Latest) -> bool:
+        return self._count - latest.place > max(SILENT, TIMES * latest.every)
+
+    def _owe(self, number: int, silent: Latest) -> None:
+        """Note what is missing if another publisher sent this frame, and the silent one is dead."""
+        other = max((latest for latest in self._lower(number, NEAR) if not self._is_silent(latest)), default=None)
+        if other is not None:
+            owed = silent.number - other.number + silent.owed
+            self._latest[self._latest.index(other)] = other._replace(owed=owed)
 
 
 @dataclass
