@@ -106,8 +106,8 @@ FAULTS = {
         ("'T1': (8.0, 'A step", "'T1': (2.0, 'A step"),
     ],
     'refinement': [
-        ('(sd - slant / second) / n', '(sd + slant / second) / n'),
-        ('np.float32(r - q) - first / second', 'np.float32(r - q) + first / second'),
+        ('(total(sd) - total(slant) / second) / n', '(total(sd) + total(slant) / second) / n'),
+        ('r - q - first / second', 'r - q + first / second'),
         ('shift - turn * middle', 'shift + turn * middle'),
         ('(low, high) if way == 1 else (-high, -low)', '(low, high) if way == 1 else (-low, -high)'),
         ("(0.0 if line['sign'] > 0 else math.pi) - angle", "(0.0 if line['sign'] > 0 else math.pi) + angle"),
@@ -120,6 +120,10 @@ FAULTS = {
         ('(most - intercept) / slope', '(most + intercept) / slope'),
         ('range(counts.size - 2, -1, -1)', 'range(counts.size - 2, 0, -1)'),
         ('min(last, size_p - 1.0)', 'min(last, size_p - 2.0)'),
+        ('numbers < size', 'numbers <= size'),
+        ('floats(s * stride) - half', 'floats(s * stride) + half'),
+        ('numbers <= farthest - known', 'numbers < farthest - known'),
+        ('upper * second + lower * across', 'lower * second + upper * across'),
     ],
     'scanning': [
         ('back = -1 if right else 1', 'back = 1 if right else -1'),
@@ -165,6 +169,9 @@ FAULTS = {
     'vectors': [
         ('k + distance if not k & distance else TILE + k', 'k if not k & distance else TILE + k'),
         ('builder.fadd(', 'builder.fsub('),
+        ("_comparison('<='), _MASK", "_comparison('<'), _MASK"),
+        ('list(range(STEPS))', 'list(range(1, STEPS + 1))'),
+        ('ir.Constant(both.type, [bits] * STEPS)', 'ir.Constant(both.type, [bits - 1] * STEPS)'),
         ('target_start + column * target_step + row', 'target_start + row * target_step + column'),
     ],
 }

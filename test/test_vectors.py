@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from line_feature_node.core import extract, vectors
-from line_feature_node.core.vectors import LANES, TILE
+from line_feature_node.core.vectors import LANES, STEPS, TILE
 
 Floats = npt.NDArray[np.float32]
 
@@ -26,13 +26,8 @@ def move(source: Any, start: int, target: Any, target_start: int) -> None:
 
 
 @numba.njit
-def scale(factor: float, source: Any, start: int, target: Any) -> None:
-    vectors.store(target, 0, vectors.multiply(factor, vectors.load(source, start)))
-
-
-@numba.njit
-def scale_and_add(factor: float, source: Any, start: int, summand: Any, target: Any) -> None:
-    vectors.store(target, 0, vectors.multiply_add(factor, vectors.load(source, start), vectors.load(summand, 0)))
+def combine(factor: float, source: Any, start: int, summand: Any, target: Any) -> None:
+    vectors.store(target, 0, factor * vectors.load(source, start) + vectors.load(summand, 0))
 
 
 @numba.njit
@@ -68,21 +63,170 @@ def test_store(start: int) -> None:
 
 
 @pytest.mark.parametrize('factor', [0.0, 1.0, -0.37, 1e-20, 3e20])
-def test_multiply(factor: float) -> None:
-    source, target = values(2 * LANES), np.zeros(LANES, np.float32)
-    scale(np.float32(factor), source, 5, target)
-    np.testing.assert_array_equal(target, vectors.multiply_plain(np.float32(factor), source[5:5 + LANES]))
-
-
-@pytest.mark.parametrize('factor', [0.0, 1.0, -0.37, 1e-20, 3e20])
-def test_multiply_add(factor: float) -> None:
+def test_product_and_sum_of_rows(factor: float) -> None:
     """Rounded once or twice: the two differ by a rounding of the product at most."""
     source, summand, target = values(2 * LANES), values(LANES, seed=1), np.zeros(LANES, np.float32)
-    scale_and_add(np.float32(factor), source, 5, summand, target)
+    combine(np.float32(factor), source, 5, summand, target)
     vector = source[5:5 + LANES]
-    plain = vectors.multiply_add_plain(np.float32(factor), vector, summand)
+    plain = np.float32(factor) * vector + summand
     rounding = np.finfo(np.float32).eps * (abs(np.float64(np.float32(factor)) * vector) + abs(summand))
     assert (abs(target.astype(np.float64) - plain) <= rounding).all()
+
+
+# Steps along a line. What is compiled and its plain twin are both given what a kernel has: arrays, and numbers.
+
+@numba.njit
+def arithmetic(a: Any, b: Any, number: float, results: Any) -> None:
+    x, y = vectors.pairs(a, vectors.ramp(0))[0], vectors.pairs(b, vectors.ramp(0))[0]
+    vectors.store(results, 0, x + y)
+    vectors.store(results, 8, x - y)
+    vectors.store(results, 16, x * y)
+    vectors.store(results, 24, x / y)
+    vectors.store(results, 32, abs(x))
+    vectors.store(results, 40, number - x)
+    vectors.store(results, 48, x * number)
+    vectors.store(results, 56, vectors.floor(x))
+    vectors.store(results, 64, vectors.floats(vectors.integers(x)))
+    vectors.store(results, 72, vectors.smaller(x, y))
+    vectors.store(results, 80, vectors.larger(x, y))
+    vectors.store(results, 88, vectors.larger(x, number))
+    vectors.store(results, 96, vectors.where(x < y, x, number))
+    vectors.store(results, 104, vectors.where((x <= y) & (y >= number), x, y))
+    vectors.store(results, 112, vectors.every(vectors.total(x)))
+    results[120] = vectors.total(y)
+
+
+def plain_arithmetic(a: Floats, b: Floats, number: float) -> Floats:
+    x, y = a[0:16:2], b[0:16:2]
+    results = [x + y, x - y, x * y, x / y, abs(x), number - x, x * number, np.floor(x),
+               vectors.floats_plain(vectors.integers_plain(x)), vectors.smaller_plain(x, y), vectors.larger_plain(x, y),
+               vectors.larger_plain(x, number), vectors.where_plain(x < y, x, number),
+               vectors.where_plain((x <= y) & (y >= number), x, y), vectors.every_plain(vectors.total_plain(x)),
+               vectors.total_plain(y)]
+    return np.hstack(results).astype(np.float32)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_arithmetic_along_a_line(seed: int) -> None:
+    a, b, results = values(2 * STEPS, seed), values(2 * STEPS, seed + 100), np.zeros(15 * STEPS + 1, np.float32)
+    a[:6:2], b[:6:2] = (3, -3, 0.5), (3, 2.5, 0.5)  # equal ones, and halves
+    arithmetic(a, b, np.float32(0.25), results)
+    np.testing.assert_allclose(results, plain_arithmetic(a, b, np.float32(0.25)), rtol=1e-6)
+
+
+def test_arithmetic_of_what_is_no_number() -> None:
+    """A comparison with it is false, so that the other one is chosen."""
+    a, b, results = values(2 * STEPS), values(2 * STEPS, 1), np.zeros(15 * STEPS + 1, np.float32)
+    a[0], a[2], b[4] = np.nan, np.inf, np.nan
+    with np.errstate(invalid='ignore'):
+        plain = plain_arithmetic(a, b, np.float32(0.25))
+    arithmetic(a, b, np.float32(0.25), results)
+    whole = slice(64, 72)  # there is no whole number for these
+    results[whole], plain[whole] = 0, 0
+    np.testing.assert_allclose(results, plain, rtol=1e-6)
+    assert results[72] == b[0]
+    assert results[80] == b[0]
+
+
+@numba.njit
+def whole_numbers(first: int, number: int, results: Any) -> None:
+    s = vectors.ramp(first)
+    vectors.store(results, 0, vectors.floats(s))
+    vectors.store(results, 8, vectors.floats(s * number - 2))
+    vectors.store(results, 16, vectors.floats(vectors.larger(vectors.smaller(s, number), 3)))
+    vectors.store(results, 24, vectors.where((s < number) & (s >= 3), vectors.every(1), 0))
+
+
+def test_whole_numbers() -> None:
+    results = np.zeros(4 * STEPS, np.float32)
+    whole_numbers(1, 5, results)
+    s = vectors.ramp_plain(1)
+    np.testing.assert_array_equal(s, [1, 2, 3, 4, 5, 6, 7, 8])
+    np.testing.assert_array_equal(results, np.hstack([
+        s, s * 5 - 2, vectors.larger_plain(vectors.smaller_plain(s, 5), 3),
+        vectors.where_plain((s < 5) & (s >= 3), vectors.every_plain(1), 0)]))
+
+
+def test_total_has_the_same_order_everywhere() -> None:
+    """Of numbers that are lost beside others, which are lost depends on the order."""
+    vector = np.array([1e8, 1, 2, 3, -1e8, 5, 6, 7], np.float32)
+    a, results = np.repeat(vector, 2), np.zeros(15 * STEPS + 1, np.float32)
+    arithmetic(a, a, np.float32(0), results)
+    halves = vector[:4] + vector[4:]
+    assert results[120] == vectors.total_plain(vector) == halves[:2].sum() + halves[2:].sum() == 24
+
+
+@numba.njit
+def gather(array: Any, first: int, results: Any) -> None:
+    x, y = vectors.pairs(array, (vectors.ramp(0) * 3 + first))
+    vectors.store(results, 0, x)
+    vectors.store(results, 8, y)
+
+
+@pytest.mark.parametrize('dtype', [np.int16, np.float32])
+def test_pairs(dtype: Any) -> None:
+    """Both numbers of each, with their signs."""
+    array = np.random.default_rng(0).integers(-32768, 32768, 60).astype(dtype)
+    array[[8, 9, 14, 15]] = -32768, 32767, 32767, -32768
+    results = np.zeros(2 * STEPS, np.float32)
+    gather(array, 4, results)
+    index = np.arange(4, 4 + 3 * STEPS, 3)
+    np.testing.assert_array_equal(results, np.hstack([array[2 * index], array[2 * index + 1]]).astype(np.float32))
+    np.testing.assert_array_equal(results, np.hstack(vectors.pairs_plain(array, index.astype(np.int32))))
+
+
+def test_plain_pairs_are_in_the_array() -> None:
+    """What the compiler would read from elsewhere is an error."""
+    for first in (-1, 8):
+        with pytest.raises(IndexError):
+            vectors.pairs_plain(np.zeros(16, np.int16), np.array([first] * STEPS, np.int32))
+
+
+@numba.njit
+def ask(array: Any, index: int) -> None:
+    vectors.fetch(array, index)
+
+
+@pytest.mark.parametrize('index', [0, 3, -1, 10**15])
+@pytest.mark.parametrize('dtype', [np.uint8, np.dtype([('a', np.float64, 20), ('b', np.int8)])])
+def test_anything_can_be_asked_for(dtype: Any, index: int) -> None:
+    array = np.zeros(4, dtype)
+    ask(array, index)
+    vectors.fetch_plain(array, index)
+    assert array.tobytes() == bytes(array.nbytes)
+
+
+BOUNDS = """
+import sys
+import numba, numpy as np
+from line_feature_node.core import vectors
+@numba.njit
+def load(array, index, target): vectors.store(target, 0, vectors.load(array, index))
+@numba.njit
+def store(array, index, target): vectors.store(array, index, vectors.load(target, 0))
+@numba.njit
+def pairs(array, index, target): vectors.store(target, 0, vectors.pairs(array, vectors.ramp(index))[0])
+@numba.njit
+def turn(array, index, target): vectors.transpose(array, index, 16, target, 0, 16)
+array, target = np.zeros(256 + 32, np.float32), np.zeros(256, np.float32)
+for function, last in ((load, 256), (store, 256), (pairs, 136), (turn, 32)):
+    for index in (0, last):
+        function(array, index, target)
+    for index in (-1, last + 1):
+        try:
+            function(array, index, target)
+        except IndexError:
+            continue
+        sys.exit(f'{function.__name__} at {index}')
+"""
+
+
+def test_bounds_of_vectors_are_checked_where_those_of_arrays_are(tmp_path: Path) -> None:
+    root = str(Path(__file__).parents[1])
+    run = subprocess.run([sys.executable, '-c', BOUNDS], capture_output=True, text=True, check=False, env=os.environ | {
+        'NUMBA_BOUNDSCHECK': '1', 'NUMBA_CACHE_DIR': str(tmp_path),
+        'PYTHONPATH': os.pathsep.join([root, os.environ.get('PYTHONPATH', '')])})
+    assert run.returncode == 0, run.stderr[-2000:]
 
 
 @pytest.mark.parametrize(('start', 'step', 'target_start', 'target_step'), [

@@ -20,7 +20,7 @@ from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.parameters import Parameters
 from line_feature_node.core.team import ALONE, Team
-from line_feature_node.core.vectors import LANES, TILE, load, multiply, multiply_add, store, transpose
+from line_feature_node.core.vectors import LANES, TILE, load, store, transpose
 
 #: In a mark: the direction code, 1 to 4, of a pixel that passed the suppression and exceeds T2; 0 is background.
 CODE = 7
@@ -287,18 +287,18 @@ def smooth_strip(strip: Any, width: int, q: Any) -> None:
     store(strip, 0, y1)
     store(strip, LANES, y1)
     for k in range(PAD * LANES, end, LANES):
-        y = multiply_add(first, y1, multiply_add(second, y2, multiply(gain, load(strip, k))))
+        y = first * y1 + (second * y2 + gain * load(strip, k))
         store(strip, k, y)
         y1, y2 = y, y1
     of_x, of_u, of_u1 = start_weights(q, 1)
-    v1 = multiply_add(of_x, x, multiply_add(of_u, y1, multiply(of_u1, y2)))
+    v1 = of_x * x + (of_u * y1 + of_u1 * y2)
     of_x, of_u, of_u1 = start_weights(q, 2)
-    v2 = multiply_add(of_x, x, multiply_add(of_u, y1, multiply(of_u1, y2)))
+    v2 = of_x * x + (of_u * y1 + of_u1 * y2)
     store(strip, end, v1)
     store(strip, end + LANES, v2)
     y1, y2 = v1, v2
     for k in range(end - LANES, -1, -LANES):
-        y = multiply_add(first, y1, multiply_add(second, y2, multiply(gain, load(strip, k))))
+        y = first * y1 + (second * y2 + gain * load(strip, k))
         store(strip, k, y)
         y1, y2 = y, y1
 

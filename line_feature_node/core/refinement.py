@@ -23,6 +23,22 @@ from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.features import SEGMENT_DTYPE, VERTICAL, points_up
 from line_feature_node.core.parameters import Parameters
 from line_feature_node.core.team import Team
+from line_feature_node.core.vectors import (
+    CACHE_LINE,
+    STEPS,
+    every,
+    fetch,
+    floats,
+    floor,
+    integers,
+    larger,
+    pairs,
+    ramp,
+    smaller,
+    store,
+    total,
+    where,
+)
 
 #: A line while it grows.
 RIDGE_DTYPE = np.dtype([
@@ -99,6 +115,10 @@ ARC = 0.273
 DIRECTIONS, IS_CLAIMED = 128, 128
 #: Claims count where the directions differ by at most so many steps, 25 degrees.
 SAME_DIRECTION = 9
+#: How many lines before their turn what is along them is asked for, and they themselves are.
+AHEAD, FAR_AHEAD = 2, 10
+#: Pixels whose gradients, in whole numbers, come from memory together.
+TOGETHER = CACHE_LINE // 4
 #: The part of the correlation length along an edge from which on peaks are independent, as measured.
 INDEPENDENT = 0.8
 #: Peaks are known to a fiftieth of a pixel at best, in whole grey levels.
@@ -158,7 +178,7 @@ def first_guesses(lines: NDArray[np.void], count: int, ridges: Ridges, buffers: 
     guesses = Guesses(buffers.array('first ridges', count, RIDGE_DTYPE)[:count],
                       buffers.array('strengths', count, np.float32)[:count])
     gradient = ridges.gradient
-    lay(lines, gradient.reshape(-1), 2 * gradient.shape[1], ridges.pad, ridges.height, ridges.width, *guesses)
+    lay(lines, gradient.reshape(-1), gradient.shape[1], ridges.pad, ridges.height, ridges.width, *guesses)
     return guesses
 
 
@@ -189,7 +209,7 @@ def refine_lines(
         SEGMENT_DTYPE, strongest first guess first, a new array.
     """
     gradient, pad, height, width, noise, step, correlation = ridges
-    flat, stride = gradient.reshape(-1), 2 * gradient.shape[1]
+    flat, stride = gradient.reshape(-1), gradient.shape[1]
     grown, strengths = joined_guesses(parts, buffers)
     # The first bits of floats are in their order, and sorted faster, by counting.
     order = np.argsort(~(strengths.view(np.uint32) >> 16).astype(np.uint16), kind='stable')
@@ -219,40 +239,71 @@ def refine_lines(
 
 # Looking at a line
 
-@inlined
-def axes(steep: bool, origin: int, stride: int, height: int, width: int) -> tuple[int, int, int, int, int, int]:
-    """How a line sees the gradient, of which a pixel has two components beside each other, and the picture.
+class Axes(NamedTuple):
+    """How a line sees the picture.
 
-    Returns:
-        Where the components along p and along q of the first pixel are; what a step along p and along q adds to an
-        index; how many steps of p and of q the picture has.
+    Attributes:
+        origin: The first pixel of the picture, among those of the gradient.
+        step_p, step_q: What a step along p and along q adds to the number of a pixel.
+        size_p, size_q: How many steps of p and of q the picture has.
     """
-    if steep:
-        return origin + 1, origin, stride, 2, height, width
-    return origin, origin + 1, 2, stride, width, height
+
+    origin: int
+    step_p: int
+    step_q: int
+    size_p: int
+    size_q: int
 
 
 @inlined
-def across(gradient: Any, along_p: int, along_q: int, np_: Any, nq: Any) -> Any:
-    """The gradient across a line at a pixel, its part along the normal, from where its components stand.
-
-    Indices are unsigned, for which Numba leaves out the test whether to count from the end.
-    """
-    return np_ * gradient[np.uint64(along_p)] + nq * gradient[np.uint64(along_q)]
-
-
-@inlined
-def profile(gradient: Any, along_p: int, along_q: int, step_q: int, np_: Any, nq: Any) -> tuple[Any, Any, Any]:
-    """The gradient across a line at a pixel, and at those beside it, towards smaller and larger q."""
-    return (across(gradient, along_p - step_q, along_q - step_q, np_, nq), across(gradient, along_p, along_q, np_, nq),
-            across(gradient, along_p + step_q, along_q + step_q, np_, nq))
+def axes_of(line: Any, stride: int, pad: int, height: int, width: int) -> Axes:
+    """Those of a line, where rows of the gradient have so many pixels."""
+    origin = pad * (stride + 1)
+    if line['steep']:
+        return Axes(origin, stride, 1, height, width)
+    return Axes(origin, 1, stride, width, height)
 
 
 @inlined
-def normal_of(slope: float, sign: float) -> tuple[Any, Any]:
-    """The unit normal of a line that the gradient points along, its parts along p and q."""
-    scale = sign / math.sqrt(1 + slope * slope)
+def normal_of(line: Any) -> tuple[Any, Any]:
+    """The unit normal of a line that the gradient points along, its parts along x and y."""
+    slope = line['slope']
+    scale = line['sign'] / math.sqrt(1 + slope * slope)
+    if line['steep']:
+        return np.float32(scale), np.float32(-slope * scale)
     return np.float32(-slope * scale), np.float32(scale)
+
+
+@inlined
+def across(gradient: Any, pixels: Any, nx: Any, ny: Any) -> Any:
+    """The gradient across a line at pixels, its part along the normal."""
+    x, y = pairs(gradient, pixels)
+    return nx * x + ny * y
+
+
+@inlined
+def profile(gradient: Any, pixels: Any, step_q: int, nx: Any, ny: Any) -> tuple[Any, Any, Any]:
+    """The gradient across a line at pixels, and at those beside them, towards smaller and larger q."""
+    return (across(gradient, pixels - step_q, nx, ny), across(gradient, pixels, nx, ny),
+            across(gradient, pixels + step_q, nx, ny))
+
+
+@inlined
+def pixel_at(p: int, line: Any, axes: Axes) -> tuple[Any, int]:
+    """Where a line is in a step of p: how far beyond a whole q, and the pixel there.
+
+    Along a line q is counted from that pixel: single precision is enough for it then, however large the picture is.
+    """
+    q = line['slope'] * p + line['intercept']
+    whole = math.floor(q)
+    return np.float32(q - whole), axes.origin + p * axes.step_p + whole * axes.step_q
+
+
+@inlined
+def steps(first: int, size: int) -> tuple[Any, Any]:
+    """STEPS steps from one on, of which there are so many in all: which are there, and the last one for the others."""
+    numbers = ramp(first)
+    return numbers < size, smaller(numbers, size - 1)
 
 
 @inlined
@@ -264,11 +315,15 @@ def within(
     Where it is nowhere, the last is less than the first; so it is for what is no number. By rounding the line may be
     a little farther out there.
     """
+    least, most = -beyond, size_q - 1 + beyond
+    at_first, at_last = slope * first + intercept, slope * last + intercept
+    # Nearly all lines are inside, with no need to divide.
+    if 0 <= first <= last <= size_p - 1 and min(at_first, at_last) >= least and max(at_first, at_last) <= most:
+        return math.ceil(first), math.floor(last)
     # Of a number and what is none, min and max give the one or the other.
     if not (abs(slope) < FARTHEST and abs(intercept) < FARTHEST and abs(first) < FARTHEST and abs(last) < FARTHEST):
         return 0, -1
     low, high = max(first, 0.0), min(last, size_p - 1.0)
-    least, most = -beyond, size_q - 1 + beyond
     if slope != 0:
         at_least, at_most = (least - intercept) / slope, (most - intercept) / slope
         low, high = max(low, min(at_least, at_most)), min(high, max(at_least, at_most))
@@ -279,27 +334,45 @@ def within(
 
 
 @kernel
-def mean_response(
-    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int,
-) -> float:
+def mean_response(line: Any, gradient: Any, axes: Axes) -> float:
     """The mean gradient across a line, in some of the pixels along it; arguments as for :func:`align`."""
-    slope, intercept = line['slope'], line['intercept']
-    np_, nq = normal_of(slope, line['sign'])
-    low, high = within(slope, intercept, line['first'], line['last'], HALF, size_p, size_q)
-    total, count = 0.0, 0
-    for p in range(low, high + 1, max((high - low) // SAMPLES, 1)):
-        index = p * step_p + math.floor(slope * p + intercept + HALF) * step_q
-        total += across(gradient, in_p + index, in_q + index, np_, nq)
-        count += 1
-    return total / max(count, 1)
+    low, high = within(line['slope'], line['intercept'], line['first'], line['last'], HALF, axes.size_p, axes.size_q)
+    if high < low:
+        return 0.0
+    stride = max((high - low) // SAMPLES, 1)
+    n = (high - low) // stride + 1
+    nx, ny = normal_of(line)
+    beyond, pixel = pixel_at(low, line, axes)
+    rise = np.float32(line['slope'] * stride)
+    response = every(0)
+    for k in range(0, n, STEPS):
+        there, s = steps(k, n)
+        r = integers(floor(rise * floats(s) + (beyond + HALF)))
+        at = across(gradient, s * (stride * axes.step_p) + r * axes.step_q + pixel, nx, ny)
+        response = response + where(there, at, ZERO)
+    return float(total(response)) / n
+
+
+@inlined
+def fetch_along(line: Any, gradient: Any, axes: Axes, claims: Any, height: int, width: int) -> None:
+    """Ask for what will be looked at along a line: that comes while others grow."""
+    low, high = within(line['slope'], line['intercept'], line['first'], line['last'], HALF, axes.size_p, axes.size_q)
+    step_p, step_q, _, __ = cells(line['steep'], height, width)
+    # Pixels across a steep line are beside each other in memory, and those along a flat one.
+    pace = CELL if line['steep'] else TOGETHER
+    for p in range(low, high + pace, pace):
+        _, pixel = pixel_at(p, line, axes)
+        fetch(claims, p // CELL * step_p + int(line['slope'] * p + line['intercept']) // CELL * step_q)
+        fetch(gradient, 2 * pixel)
+        fetch(gradient, 2 * (pixel + max(axes.step_p, axes.step_q)))
+        if not line['steep']:
+            fetch(gradient, 2 * (pixel - axes.step_q))
 
 
 # Aligning
 
 @kernel
-def align(
-    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, move: float,
-) -> None:
+def align(line: Any, gradient: Any, axes: Axes, move: float) -> None:
     """Shift and turn a line to about where the gradient across it peaks.
 
     In each step of p the peak would be that of the parabola through the gradient at three pixels across. In the noise
@@ -308,88 +381,92 @@ def align(
     Args:
         line: It is changed, and receives its mean response.
         gradient: Its components, flat.
-        in_p, in_q: Index of the components along p and q at the first pixel of the picture.
-        step_p, step_q: What a step along p and q adds to an index.
-        size_p, size_q: Pixels of the picture along p and q.
+        axes: Those of the line.
         move: The farthest that an end moves.
     """
-    slope, intercept = line['slope'], line['intercept']
-    np_, nq = normal_of(slope, line['sign'])
     trim = min(TRIM, LARGEST_TRIM * (line['last'] - line['first']))
-    low, high = within(slope, intercept, line['first'] + trim, line['last'] - trim, HALF, size_p, size_q)
+    low, high = within(line['slope'], line['intercept'], line['first'] + trim, line['last'] - trim, HALF, axes.size_p,
+                       axes.size_q)
     if high - low + 1 < SHORTEST_GROWING:
         return
     stride = min(1 + (high - low) // ROUGH, SPARSEST)
     n = (high - low) // stride + 1
     low += (high - low) % stride // 2
-    middle = low + 0.5 * stride * (n - 1)
-    response = curvature = slant = slant_t = sd = std = ZERO
-    for p in range(low, high + 1, stride):
-        q = slope * p + intercept
-        r = math.floor(q + HALF)
-        index = p * step_p + r * step_q
-        before, at, behind = profile(gradient, in_p + index, in_q + index, step_q, np_, nq)
-        t, d, first = np.float32(p - middle), np.float32(r - q), behind - before
-        response += at
-        curvature += behind + before - (at + at)
-        slant += first
-        slant_t += t * first
-        sd += d
-        std += t * d
-    line['response'] = response / n
-    second = 2.0 * curvature / n
+    nx, ny = normal_of(line)
+    beyond, pixel = pixel_at(low, line, axes)
+    rise, half = np.float32(line['slope'] * stride), np.float32(0.5 * stride * (n - 1))
+    response = curvature = slant = slant_t = sd = std = every(0)
+    for k in range(0, n, STEPS):
+        there, s = steps(k, n)
+        q = rise * floats(s) + beyond
+        r = floor(q + HALF)
+        before, at, behind = profile(
+            gradient, s * (stride * axes.step_p) + integers(r) * axes.step_q + pixel, axes.step_q, nx, ny)
+        t = floats(s * stride) - half
+        d, first = where(there, r - q, ZERO), where(there, behind - before, ZERO)
+        response = response + where(there, at, ZERO)
+        curvature = curvature + where(there, behind + before - (at + at), ZERO)
+        slant = slant + first
+        slant_t = slant_t + t * first
+        sd = sd + d
+        std = std + t * d
+    line['response'] = float(total(response)) / n
+    second = 2.0 * total(curvature) / n
     if second < -2 * CURVED * line['response']:
-        turn = (std - slant_t / second) / (stride * stride * n * (n * n - 1.0) / 12)
-        nudge(line, (sd - slant / second) / n, turn, middle, move)
+        turn = (total(std) - total(slant_t) / second) / (stride * stride * n * (n * n - 1.0) / 12)
+        nudge(line, (total(sd) - total(slant) / second) / n, turn, low + half, move)
 
 
 @kernel
-def align_to_peaks(
-    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, move: float,
-) -> float:
+def align_to_peaks(line: Any, gradient: Any, axes: Axes, move: float) -> float:
     """Shift and turn a line to the peaks of the gradient across it that are no farther than FARTHEST_PEAK.
 
     Args:
         line: It is changed, and receives its mean response, and variance, size and moment of the peaks, if there are
             enough.
-        gradient, in_p, in_q, step_p, step_q, size_p, size_q, move: As for :func:`align`.
+        gradient, axes, move: As for :func:`align`.
 
     Returns:
         How far its ends moved, q.
     """
-    slope, intercept = line['slope'], line['intercept']
-    np_, nq = normal_of(slope, line['sign'])
     trim = min(TRIM, LARGEST_TRIM * (line['last'] - line['first']))
-    low, high = within(slope, intercept, line['first'] + trim, line['last'] - trim, HALF, size_p, size_q)
-    middle = 0.5 * (low + high)
-    n = 0
-    response = st = stt = sd = std = sdd = ZERO
-    for p in range(low, high + 1):
-        q = slope * p + intercept
-        r = math.floor(q + HALF)
-        index = p * step_p + r * step_q
-        before, at, behind = profile(gradient, in_p + index, in_q + index, step_q, np_, nq)
-        response += at
+    low, high = within(line['slope'], line['intercept'], line['first'] + trim, line['last'] - trim, HALF, axes.size_p,
+                       axes.size_q)
+    size = high - low + 1
+    if size < SHORTEST_GROWING:
+        return 0.0
+    nx, ny = normal_of(line)
+    beyond, pixel = pixel_at(low, line, axes)
+    rise, half = np.float32(line['slope']), np.float32(0.5 * (size - 1))
+    response = peaks = sum_t = sum_tt = sum_d = sum_td = sum_dd = every(0)
+    for k in range(0, size, STEPS):
+        there, s = steps(k, size)
+        q = rise * floats(s) + beyond
+        r = floor(q + HALF)
+        before, at, behind = profile(
+            gradient, s * axes.step_p + integers(r) * axes.step_q + pixel, axes.step_q, nx, ny)
+        response = response + where(there, at, ZERO)
         first, second = behind - before, behind + before - (at + at)
-        second += second
-        if abs(first) < -FARTHEST_PEAK * second:
-            t, d = np.float32(p - middle), np.float32(r - q) - first / second
-            n += 1
-            st += t
-            stt += t * t
-            sd += d
-            std += t * d
-            sdd += d * d
+        second = second + second
+        near = there & (abs(first) < second * -FARTHEST_PEAK)
+        t, d = where(near, floats(s) - half, ZERO), where(near, r - q - first / second, ZERO)
+        peaks = peaks + where(near, every(1), ZERO)
+        sum_t = sum_t + t
+        sum_tt = sum_tt + t * t
+        sum_d = sum_d + d
+        sum_td = sum_td + t * d
+        sum_dd = sum_dd + d * d
+    n = int(total(peaks))
     if n < SHORTEST_GROWING:
         return 0.0
-    moment = stt - float(st) * st / n
-    turn = (std - float(st) * sd / n) / moment
+    st, sd, std = float(total(sum_t)), float(total(sum_d)), float(total(sum_td))
+    moment = total(sum_tt) - st * st / n
+    turn = (std - st * sd / n) / moment
     shift = (sd - turn * st) / n
-    line['response'] = response / (high - low + 1)
-    residual = float(sdd - shift * sd - turn * std)
-    line['variance'] = max(residual, 0.0) / max(n - 2, 1)
+    line['response'] = float(total(response)) / size
+    line['variance'] = max(total(sum_dd) - shift * sd - turn * std, 0.0) / max(n - 2, 1)
     line['size'], line['moment'] = n, moment
-    return nudge(line, shift, turn, middle, move)
+    return nudge(line, shift, turn, low + half, move)
 
 
 @inlined
@@ -406,39 +483,35 @@ def nudge(line: Any, shift: float, turn: float, middle: float, move: float) -> f
 # Growing
 
 @inlined
-def support(
-    q: float, gradient: Any, along_p: int, along_q: int, step_q: int, np_: Any, nq: Any, tolerance: float,
-) -> float:
-    """The gradient across a line at a place between two pixels, as far as it supports the line.
+def support(q: Any, gradient: Any, pixels: Any, step_q: int, nx: Any, ny: Any, tolerance: Any) -> Any:
+    """The gradient across a line at places between two pixels each, as far as it supports the line.
 
     It does not where it points elsewhere, or is stronger one pixel beside the line; what noise may do is tolerated.
 
     Args:
-        q: The place.
-        gradient, along_p, along_q: The gradient, and where its components are for q = 0.
-        step_q: What a step along q adds to an index.
-        np_, nq: Normal of the line.
+        q: The places, from the pixels on.
+        gradient, pixels: The gradient, and where it is looked at for q = 0.
+        step_q: What a step along q adds to the number of a pixel.
+        nx, ny: Normal of the line.
         tolerance: What noise may do.
     """
-    r = int(q)
-    lower = np.float32(q - r)
+    r = floor(q)
+    lower = q - r
     upper = ONE - lower
-    index_p, index_q = along_p + r * step_q, along_q + r * step_q
-    p1, p2 = gradient[np.uint64(index_p)], gradient[np.uint64(index_p + step_q)]
-    q1, q2 = gradient[np.uint64(index_q)], gradient[np.uint64(index_q + step_q)]
-    first, second = np_ * p1 + nq * q1, np_ * p2 + nq * q2
+    at = pixels + integers(r) * step_q
+    (x1, y1), (x2, y2) = pairs(gradient, at), pairs(gradient, at + step_q)
+    first, second = nx * x1 + ny * y1, nx * x2 + ny * y2
     response = upper * first + lower * second
-    before = upper * across(gradient, index_p - step_q, index_q - step_q, np_, nq) + lower * first
-    behind = upper * second + lower * across(gradient, index_p + 2 * step_q, index_q + 2 * step_q, np_, nq)
-    tangential = abs(nq * (upper * p1 + lower * p2) - np_ * (upper * q1 + lower * q2))
-    supports = (tangential <= TANGENT * response + tolerance) & (max(before, behind) <= response + tolerance)
-    return response if supports else min(response, ZERO)
+    before = upper * across(gradient, at - step_q, nx, ny) + lower * first
+    behind = upper * second + lower * across(gradient, at + 2 * step_q, nx, ny)
+    tangential = abs(ny * (upper * x1 + lower * x2) - nx * (upper * y1 + lower * y2))
+    supports = (tangential <= TANGENT * response + tolerance) & (larger(before, behind) <= response + tolerance)
+    return where(supports, response, smaller(response, ZERO))
 
 
 @kernel
 def extend(
-    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, noise: float,
-    limit: float, at_first: bool, at_last: bool, values: Any,
+    line: Any, gradient: Any, axes: Axes, noise: float, limit: float, at_first: bool, at_last: bool, values: Any,
 ) -> None:
     """Move the ends of a line to where the gradient across it ends; arguments as for :func:`align`.
 
@@ -453,20 +526,18 @@ def extend(
     size = WINDOW + WINDOW_NOISE * (noise / max(line['response'], 1e-6))**2
     if not size < LARGEST_WINDOW:
         size = LARGEST_WINDOW
-    half = int(size) // 2
+    half, tolerance = int(size) // 2, np.float32(TOLERANCE * noise)
     first, last = line['first'], line['last']
     if at_last:
-        line['last'] = end_of(line, 1, last, first, half, gradient, in_p, in_q, step_p, step_q, size_p, size_q,
-                              np.float32(TOLERANCE * noise), limit, values)
+        line['last'] = end_of(line, 1, last, first, half, gradient, axes, tolerance, limit, values)
     if at_first:
-        line['first'] = -end_of(line, -1, -first, -last, half, gradient, in_p, in_q, step_p, step_q, size_p, size_q,
-                                np.float32(TOLERANCE * noise), limit, values)
+        line['first'] = -end_of(line, -1, -first, -last, half, gradient, axes, tolerance, limit, values)
 
 
 @kernel
 def end_of(
-    line: Any, way: int, end: float, other: float, half: int, gradient: Any, in_p: int, in_q: int, step_p: int,
-    step_q: int, size_p: int, size_q: int, tolerance: float, limit: float, values: Any,
+    line: Any, way: int, end: float, other: float, half: int, gradient: Any, axes: Axes, tolerance: Any, limit: float,
+    values: Any,
 ) -> float:
     """Where a line ends on one side, in steps of p outwards; `way` is 1 where these are p itself, and -1 for -p.
 
@@ -474,28 +545,23 @@ def end_of(
     response: that of the line, and farther out that of about the last MEMORY steps. Between two steps the end is
     interpolated. Outside the picture nothing supports a line, and no line ends.
     """
-    slope, intercept, before = line['slope'], line['intercept'], line['response']
-    np_, nq = normal_of(slope, line['sign'])
-    low, high = within(slope, intercept, 0.0, size_p - 1.0, 0.0, size_p, size_q)
+    low, high = within(line['slope'], line['intercept'], 0.0, axes.size_p - 1.0, 0.0, axes.size_p, axes.size_q)
     nearest, farthest = (low, high) if way == 1 else (-high, -low)
     place = math.floor(end - min(half + INSIDE, 0.5 * (end - other)))
     start, base, size = place, place - half, 2 * half + 1
-    window, earlier, found = 0.0, 2 * END * before, float(place)
-    step = base
+    # Sums over a window, in place of means.
+    window, earlier, least, found = 0.0, 0.0, END * size * line['response'], float(place)
+    step = seen = base
     while True:
-        value: Any = ZERO
-        if nearest <= step <= farthest:
-            p = way * step
-            value = support(slope * p + intercept, gradient, in_p + p * step_p, in_q + p * step_p, step_q, np_, nq,
-                            tolerance)
-        values[step - base] = value
-        window += value
+        if step == seen:
+            look_on(line, way, base, seen, nearest, farthest, gradient, axes, tolerance, values)
+            seen += STEPS
+        window += values[step - base]
         step += 1
         if step <= place + half:
             continue
-        mean = window / size
-        if mean < END * before:
-            found = place - 1 + (earlier - END * before) / (earlier - mean) if place > start else float(place)
+        if window < least:
+            found = place - 1 + (earlier - least) / (earlier - window) if place > start else float(place)
             break
         if place >= end + limit:
             found = end + limit
@@ -504,11 +570,37 @@ def end_of(
             found = float(place)
             break
         if place > end:
-            before += (min(max(values[place - base], 0.0), 2 * before) - before) / MEMORY
-        earlier = mean
+            least += (min(max(END * size * values[place - base], 0.0), 2 * least) - least) / MEMORY
+        earlier = window
         window -= values[place - half - base]
         place += 1
     return found
+
+
+@inlined
+def look_on(
+    line: Any, way: int, base: int, step: int, nearest: int, farthest: int, gradient: Any, axes: Axes, tolerance: Any,
+    values: Any,
+) -> None:
+    """What supports a line in STEPS steps outwards, from one on, where that from the base on is kept.
+
+    Args:
+        line, way, gradient, axes, tolerance, values: As for :func:`end_of`.
+        base, step: In steps of p outwards.
+        nearest, farthest: Steps between which the line is in the picture.
+    """
+    seen = every(0)
+    if nearest <= farthest:
+        # A step in the picture that the others are counted from.
+        known = min(max(base, nearest), farthest)
+        nx, ny = normal_of(line)
+        beyond, pixel = pixel_at(way * known, line, axes)
+        numbers = ramp(step - known)
+        s = larger(smaller(numbers, farthest - known), nearest - known)
+        found = support(np.float32(way * line['slope']) * floats(s) + beyond, gradient,
+                        s * (way * axes.step_p) + pixel, axes.step_q, nx, ny, tolerance)
+        seen = where((numbers >= nearest - known) & (numbers <= farthest - known), found, ZERO)
+    store(values, step - base, seen)
 
 
 @kernel
@@ -516,7 +608,6 @@ def lay(
     lines: Any, gradient: Any, stride: int, pad: int, height: int, width: int, grown: Any, strengths: Any,
 ) -> None:
     """Turn first guesses into lines along their major axis, and tell how strong the gradient is along them."""
-    origin = pad * (stride + 2)
     for k in range(grown.size):
         guess, line = lines[k], grown[k]
         steep = abs(guess['sin']) > guess['cos']
@@ -530,8 +621,7 @@ def lay(
             line['intercept'] = guess['y'] - line['slope'] * guess['x']
             line['first'], line['last'] = min(guess['x1'], guess['x2']), max(guess['x1'], guess['x2'])
         line['sign'] = 1.0
-        in_p, in_q, step_p, step_q, size_p, size_q = axes(steep, origin, stride, height, width)
-        response = mean_response(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q)
+        response = mean_response(line, gradient, axes_of(line, stride, pad, height, width))
         if response < 0:
             line['sign'], response = -1.0, -response
         line['response'], line['size'], line['alive'] = response, PENDING, False
@@ -556,7 +646,13 @@ def grow(
     """
     for k in range(claims.size):
         claims[k] = 0
-    for k in order:
+    for place in range(order.size):
+        if place + FAR_AHEAD < order.size:
+            fetch(guesses, order[place + FAR_AHEAD])
+        if place + AHEAD < order.size:
+            next_one = guesses[order[place + AHEAD]]
+            fetch_along(next_one, gradient, axes_of(next_one, stride, pad, height, width), claims, height, width)
+        k = order[place]
         guess, line = guesses[k], grown[k]
         line['alive'] = False
         if line['size'] == PENDING and not is_clear(guess, counts, HOPE * least[0], HOPE * least[1]):
@@ -565,8 +661,8 @@ def grow(
             continue
         if line['size'] == PENDING:
             grown[k] = guess
-            grow_guess(line, counts, GROWN * least[0], GROWN * least[1], gradient, stride, pad, height, width, noise,
-                       values)
+            grow_guess(line, counts, GROWN * least[0], GROWN * least[1], gradient,
+                       axes_of(line, stride, pad, height, width), noise, values)
         if line['size'] > 0 and leave(line, claims, height, width) <= REST_CLAIMED:
             line['alive'] = True
             claim(line, claims, height, width)
@@ -574,29 +670,25 @@ def grow(
 
 @inlined
 def grow_guess(
-    line: Any, counts: Any, least_strength: float, least_evidence: float, gradient: Any, stride: int, pad: int,
-    height: int, width: int, noise: float, values: Any,
+    line: Any, counts: Any, least_strength: float, least_evidence: float, gradient: Any, axes: Axes, noise: float,
+    values: Any,
 ) -> None:
     """Let a first guess grow, and lay it along the peaks if it is as clear as that; its size is 0 if it is not."""
-    in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], pad * (stride + 2), stride, height, width)
-    grow_line(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
+    grow_line(line, gradient, axes, noise, values)
     line['size'] = 0
     if line['last'] - line['first'] >= SHORTEST_GROWING and is_clear(line, counts, least_strength, least_evidence):
-        settle(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, values)
+        settle(line, gradient, axes, noise, values)
 
 
 @kernel
-def grow_line(
-    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, noise: float,
-    values: Any,
-) -> None:
+def grow_line(line: Any, gradient: Any, axes: Axes, noise: float, values: Any) -> None:
     """Align a line and move its ends by turns; arguments as for :func:`extend`."""
     at_first = at_last = True
     for turn in range(ROUNDS):
         first, last = line['first'], line['last']
-        align(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, MOVE)
+        align(line, gradient, axes, MOVE)
         limit = max(last - first, STEP) if turn < ROUNDS - 1 else UNBOUNDED
-        extend(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, limit, at_first, at_last, values)
+        extend(line, gradient, axes, noise, limit, at_first, at_last, values)
         # An end that stayed about where it was is one; the other is looked for anew, along a better line.
         at_first, at_last = first - line['first'] > STAYS, line['last'] - last > STAYS
         if not (at_first or at_last) or line['last'] - line['first'] < GROWS * (last - first):
@@ -604,15 +696,12 @@ def grow_line(
 
 
 @kernel
-def settle(
-    line: Any, gradient: Any, in_p: int, in_q: int, step_p: int, step_q: int, size_p: int, size_q: int, noise: float,
-    values: Any,
-) -> None:
+def settle(line: Any, gradient: Any, axes: Axes, noise: float, values: Any) -> None:
     """Align a line to single peaks; arguments as for :func:`extend`."""
-    moved = align_to_peaks(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, LAST_MOVE)
+    moved = align_to_peaks(line, gradient, axes, LAST_MOVE)
     if moved > SETTLED:  # other peaks may be near enough now
-        align_to_peaks(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, LAST_MOVE)
-        extend(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, noise, 0.0, True, True, values)
+        align_to_peaks(line, gradient, axes, LAST_MOVE)
+        extend(line, gradient, axes, noise, 0.0, True, True, values)
 
 
 # Claims
@@ -798,8 +887,7 @@ def judge(
             continue
         if line['begin'] > line['first'] or line['end'] < line['last']:
             line['first'], line['last'], line['size'] = line['begin'], line['end'], 0
-            in_p, in_q, step_p, step_q, size_p, size_q = axes(line['steep'], pad * (stride + 2), stride, height, width)
-            align_to_peaks(line, gradient, in_p, in_q, step_p, step_q, size_p, size_q, 0.0)
+            align_to_peaks(line, gradient, axes_of(line, stride, pad, height, width), 0.0)
         line['alive'] = line['size'] > 0 and length_of(line) >= SHORTEST and is_clear(line, counts, least[0], least[1])
         left += line['alive']
     return left

@@ -1,51 +1,154 @@
-"""Two things that the compiler does not find by itself: a recursion in vector registers, and a transposition in them.
+"""Vectors: what the compiler does not find by itself, written as arithmetic on so many numbers at once.
 
 Numba's loops over arrays are vectorised by LLVM where one step does not depend on another. The recursion along a row
 does, so many rows are taken at once, one a lane; written as a loop over lanes LLVM keeps the state in memory (0.14
-instead of 0.03 ms for 640×480). And rows must be turned into lanes and back, for which a loop moves single floats (0.10
-instead of 0.02 ms each way). bench/vectors.py measures both.
+instead of 0.03 ms for 640×480). Rows must be turned into lanes and back, for which a loop moves single floats (0.10
+instead of 0.02 ms each way). And along a line pixels are anywhere in memory, and sums are taken one by one; several
+steps at once take half of the time. bench/vectors.py measures all.
 
-Each block is a few LLVM instructions that every processor has. Its plain twin stands beside it; tests hold the one
-against the other, and the twin runs under NUMBA_DISABLE_JIT.
+A vector is a few LLVM instructions that every processor has. Under NUMBA_DISABLE_JIT it is a NumPy array of as many
+numbers, and the functions are their plain twins, which stand beside them; tests hold the one against the other.
 """
 
+import operator
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import config, types
+from numba.core import cgutils
+from numba.core.imputils import lower_builtin
+from numba.core.typing import signature as signature_of
+from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, models, register_model
 
-#: Lanes of a vector: two registers of AVX-512, four of AVX2, eight of NEON or SSE, so that latencies are hidden.
+#: Lanes of a vector of rows: two registers of AVX-512, four of AVX2, eight of NEON or SSE, which hides latencies.
 LANES = 32
+#: Lanes of a vector of steps along a line.
+STEPS = 8
+#: Bytes that come from memory together.
+CACHE_LINE = 64
 #: Width and height of the tiles that are transposed.
 TILE = 16
 
 _PLAIN = bool(vars(config)['DISABLE_JIT'])
-_LANES = ir.VectorType(ir.FloatType(), LANES)
+_INT = ir.IntType(32)
+_ELEMENTS = {types.float32: ir.FloatType(), types.int32: _INT, types.boolean: ir.IntType(1)}
 _ROW = ir.VectorType(ir.FloatType(), TILE)
 
 
 class _Vector(types.Type):
-    """The Numba type of a vector of LANES floats."""
+    """The Numba type of a vector."""
 
-    def __init__(self) -> None:
-        super().__init__(name=f'Vector{LANES}')
-
-
-_vector = _Vector()
+    def __init__(self, element: Any, lanes: int) -> None:
+        self.element, self.lanes = element, lanes
+        self.llvm = ir.VectorType(_ELEMENTS[element], lanes)
+        super().__init__(name=f'Vector({element}, {lanes})')
 
 
 @register_model(_Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, fe_type: Any) -> None:
-        super().__init__(manager, fe_type, _LANES)
+        super().__init__(manager, fe_type, fe_type.llvm)
+
+
+_ROWS = _Vector(types.float32, LANES)
+_FLOATS, _INTEGERS, _MASK = (_Vector(element, STEPS) for element in (types.float32, types.int32, types.boolean))
 
 
 def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: Any) -> Any:
-    """LLVM pointer to a vector that begins at an index of a flat float32 array."""
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
+    """LLVM pointer to a vector that begins at an index of a flat array."""
+    array = context.make_array(array_type)(context, builder, array)
+    if context.enable_boundscheck:
+        last = builder.add(index, ir.Constant(index.type, vector.count - 1))
+        for place in (index, last):
+            cgutils.do_boundscheck(context, builder, place, cgutils.unpack_tuple(builder, array.shape)[0])
+    return builder.bitcast(builder.gep(array.data, [index]), vector.as_pointer())
 
+
+def _filled(builder: Any, vector: Any, value: Any) -> Any:
+    """The number in every lane."""
+    nothing = ir.Constant(vector.llvm, ir.Undefined)
+    first = builder.insert_element(nothing, value, ir.Constant(_INT, 0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(_INT, vector.lanes), [0] * vector.lanes))
+
+
+def _as_vectors(context: Any, builder: Any, vector: Any, kinds: Any, values: Any) -> list[Any]:
+    """Operands, of which some may be numbers, as vectors of a kind."""
+    return [value if isinstance(kind, _Vector)
+            else _filled(builder, vector, context.cast(builder, value, kind, vector.element))
+            for kind, value in zip(kinds, values, strict=True)]
+
+
+# Operators, of vectors of a kind, and of a vector and a number
+
+def _define(function: Any, generate: Callable[..., Any], result: Any = None) -> None:
+    """Teach Numba an operator.
+
+    Args:
+        function: What the operator stands for.
+        generate: From a builder and the operands, vectors, the result.
+        result: Its type; that of the operands where it is not given.
+    """
+    def generic(self: Any, arguments: Any, keywords: Any) -> Any:
+        vectors = [kind for kind in arguments if isinstance(kind, _Vector)]
+        if vectors and all(kind == vectors[0] or isinstance(kind, types.Number) for kind in arguments):
+            return signature_of(result or vectors[0], *arguments)
+        return None
+
+    infer_global(function)(type('Template', (AbstractTemplate,), {'key': function, 'generic': generic}))
+
+    def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        vector = next(kind for kind in signature.args if isinstance(kind, _Vector))
+        return generate(builder, *_as_vectors(context, builder, vector, signature.args, arguments))
+
+    for kinds in ((_Vector,), (_Vector, _Vector), (types.Number, _Vector), (_Vector, types.Number)):
+        lower_builtin(function, *kinds)(lower)
+
+
+def _is_float(operand: Any) -> bool:
+    return bool(operand.type.element == ir.FloatType())
+
+
+def _arithmetic(of_floats: str, of_integers: str) -> Callable[[Any, Any, Any], Any]:
+    def generate(builder: Any, first: Any, second: Any) -> Any:
+        if _is_float(first):
+            return getattr(builder, of_floats)(first, second, flags=('contract',))
+        return getattr(builder, of_integers)(first, second)
+
+    return generate
+
+
+def _comparison(sign: str) -> Callable[[Any, Any, Any], Any]:
+    def generate(builder: Any, first: Any, second: Any) -> Any:
+        return (builder.fcmp_ordered if _is_float(first) else builder.icmp_signed)(sign, first, second)
+
+    return generate
+
+
+def _of_llvm(name: str) -> Callable[[Any, Any], Any]:
+    """A function of LLVM's on vectors of floats."""
+    def generate(builder: Any, operand: Any) -> Any:
+        full = f'{name}.v{operand.type.count}f32'
+        return builder.call(cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(operand.type, [operand.type]), full), [operand])
+
+    return generate
+
+
+_define(operator.add, _arithmetic('fadd', 'add'))
+_define(operator.sub, _arithmetic('fsub', 'sub'))
+_define(operator.mul, _arithmetic('fmul', 'mul'))
+_define(operator.truediv, lambda builder, first, second: builder.fdiv(first, second, flags=('contract',)))
+_define(operator.lt, _comparison('<'), _MASK)
+_define(operator.le, _comparison('<='), _MASK)
+_define(operator.ge, _comparison('>='), _MASK)
+_define(operator.and_, lambda builder, first, second: builder.and_(first, second))
+_define(abs, _of_llvm('llvm.fabs'))
+
+
+# Memory
 
 def load_plain(array: Any, index: int) -> Any:
     """LANES values of a flat float32 array from an index on, as a vector."""
@@ -55,58 +158,204 @@ def load_plain(array: Any, index: int) -> Any:
 @intrinsic
 def _load(typing: Any, array: Any, index: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.load(_pointer(context, builder, signature.args[0], arguments[0], arguments[1], _LANES), align=4)
+        return builder.load(_pointer(context, builder, array, arguments[0], arguments[1], _ROWS.llvm), align=4)
 
-    return _vector(array, types.intp), generate
+    return _ROWS(array, types.intp), generate
 
 
 def store_plain(array: Any, index: int, vector: Any) -> None:
     """Put a vector into a flat float32 array from an index on."""
-    array[index:index + LANES] = vector
+    array[index:index + vector.size] = vector
 
 
 @intrinsic
 def _store(typing: Any, array: Any, index: Any, vector: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        target = _pointer(context, builder, signature.args[0], arguments[0], arguments[1], _LANES)
+        target = _pointer(context, builder, array, arguments[0], arguments[1], vector.llvm)
         builder.store(arguments[2], target, align=4)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, vector), generate
 
 
-def multiply_add_plain(factor: Any, vector: Any, summand: Any) -> Any:
-    """A number times a vector plus a vector; the processor may round once or twice."""
-    return factor * vector + summand
+def pairs_plain(array: Any, index: Any) -> tuple[Any, Any]:
+    """Both numbers of pairs that stand anywhere in a flat array, int16 or float32: one vector of each.
+
+    Args:
+        array: Of which the pairs begin at even places.
+        index: Vector of whole numbers, how many pairs are before each.
+    """
+    places = 2 * index.astype(np.int64)
+    if places.min() < 0:
+        raise IndexError(f'pair {index.min()} is before the array')
+    return array[places].astype(np.float32), array[places + 1].astype(np.float32)
 
 
 @intrinsic
-def _multiply_add(typing: Any, factor: Any, vector: Any, summand: Any) -> Any:
+def _pairs(typing: Any, array: Any, index: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fadd(_scaled(builder, *arguments[:2]), arguments[2], flags=('contract',))
+        bits = array.dtype.bitwidth
+        both = ir.Constant(ir.VectorType(ir.IntType(2 * bits), STEPS), ir.Undefined)
+        pair = ir.VectorType(both.type.element, 1)
+        for lane in range(STEPS):
+            # One load each: where processors have an instruction for all at once it is no faster.
+            number = ir.Constant(_INT, lane)
+            place = builder.sext(builder.extract_element(arguments[1], number), ir.IntType(64))
+            first = builder.shl(place, ir.Constant(place.type, 1))
+            found = builder.load(_pointer(context, builder, array, arguments[0], first, pair), align=bits // 8)
+            both = builder.insert_element(both, builder.extract_element(found, ir.Constant(_INT, 0)), number)
+        return context.make_tuple(builder, signature.return_type, _halves(builder, both))
 
-    return _vector(types.float32, vector, summand), generate
+    return types.UniTuple(_FLOATS, 2)(array, index), generate
 
 
-def multiply_plain(factor: Any, vector: Any) -> Any:
-    """A number times a vector."""
-    return factor * vector
+def _halves(builder: Any, both: Any) -> list[Any]:
+    """The lower and the upper halves of whole numbers, as floats: those of pairs in memory, the first one is lower."""
+    bits = both.type.element.width // 2
+    halves = [builder.trunc(part, ir.VectorType(ir.IntType(bits), STEPS))
+              for part in (both, builder.lshr(both, ir.Constant(both.type, [bits] * STEPS)))]
+    return [builder.bitcast(half, _FLOATS.llvm) if bits == _INT.width else builder.sitofp(half, _FLOATS.llvm)
+            for half in halves]
+
+
+def fetch_plain(array: Any, index: int) -> None:
+    """Ask for an item of an array that will be looked at soon, as it may take a while to come: any index will do."""
 
 
 @intrinsic
-def _multiply(typing: Any, factor: Any, vector: Any) -> Any:
+def _fetch(typing: Any, array: Any, index: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _scaled(builder, *arguments)
+        byte = ir.IntType(8).as_pointer()
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT]), 'llvm.prefetch.p0')
+        data = context.make_array(array)(context, builder, arguments[0]).data
+        item = builder.bitcast(builder.gep(data, [arguments[1]]), byte)
+        for place in range(0, context.get_abi_sizeof(context.get_data_type(array.dtype)), CACHE_LINE):
+            # To read, into the first cache, as data.
+            builder.call(function, [builder.gep(item, [ir.Constant(_INT, place)]),
+                                    *(ir.Constant(_INT, option) for option in (0, 3, 1))])
+        return context.get_dummy_value()
 
-    return _vector(types.float32, vector), generate
+    return types.void(array, types.intp), generate
 
 
-def _scaled(builder: Any, factor: Any, vector: Any) -> Any:
-    first = builder.insert_element(ir.Constant(_LANES, ir.Undefined), factor, ir.Constant(ir.IntType(32), 0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    repeated = builder.shuffle_vector(first, ir.Constant(_LANES, ir.Undefined), zeros)
-    return builder.fmul(repeated, vector, flags=('contract',))
+# Steps along a line
 
+def every_plain(value: float) -> Any:
+    """A number in every lane of a vector of floats."""
+    return np.full(STEPS, value, np.float32)
+
+
+@intrinsic
+def _every(typing: Any, value: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _as_vectors(context, builder, _FLOATS, signature.args, arguments)[0]
+
+    return _FLOATS(value), generate
+
+
+def ramp_plain(first: int) -> Any:
+    """Whole numbers that follow each other."""
+    return np.arange(first, first + STEPS, dtype=np.int32)
+
+
+@intrinsic
+def _ramp(typing: Any, first: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        filled = _as_vectors(context, builder, _INTEGERS, signature.args, arguments)[0]
+        return builder.add(filled, ir.Constant(_INTEGERS.llvm, list(range(STEPS))))
+
+    return _INTEGERS(first), generate
+
+
+def floats_plain(vector: Any) -> Any:
+    """Whole numbers as floats."""
+    return vector.astype(np.float32)
+
+
+@intrinsic
+def _floats(typing: Any, vector: Any) -> Any:
+    return _FLOATS(vector), lambda _, builder, __, arguments: builder.sitofp(arguments[0], _FLOATS.llvm)
+
+
+def integers_plain(vector: Any) -> Any:
+    """Floats as whole numbers, without what follows the point."""
+    return vector.astype(np.int32)
+
+
+@intrinsic
+def _integers(typing: Any, vector: Any) -> Any:
+    return _INTEGERS(vector), lambda _, builder, __, arguments: builder.fptosi(arguments[0], _INTEGERS.llvm)
+
+
+@intrinsic
+def _floor(typing: Any, vector: Any) -> Any:
+    return vector(vector), lambda _, builder, __, arguments: _of_llvm('llvm.floor')(builder, arguments[0])
+
+
+def where_plain(mask: Any, vector: Any, other: Any) -> Any:
+    """The one or the other, lane by lane; the other may be a number."""
+    return np.where(mask, vector, np.asarray(other, vector.dtype))
+
+
+@intrinsic
+def _where(typing: Any, mask: Any, vector: Any, other: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(arguments[0], *_as_vectors(
+            context, builder, vector, signature.args[1:], arguments[1:]))
+
+    return vector(mask, vector, other), generate
+
+
+def smaller_plain(vector: Any, other: Any) -> Any:
+    """The smaller one, lane by lane; the other may be a number, and stands in for what is none."""
+    return where_plain(vector < other, vector, other)
+
+
+def larger_plain(vector: Any, other: Any) -> Any:
+    """The larger one, lane by lane; the other may be a number, and stands in for what is none."""
+    return where_plain(other < vector, vector, other)
+
+
+@intrinsic
+def _smaller(typing: Any, vector: Any, other: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        first, second = _as_vectors(context, builder, vector, signature.args, arguments)
+        return builder.select(_comparison('<')(builder, first, second), first, second)
+
+    return vector(vector, other), generate
+
+
+@intrinsic
+def _larger(typing: Any, vector: Any, other: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        first, second = _as_vectors(context, builder, vector, signature.args, arguments)
+        return builder.select(_comparison('<')(builder, second, first), first, second)
+
+    return vector(vector, other), generate
+
+
+def total_plain(vector: Any) -> Any:
+    """The sum of all lanes, in the same order on every processor: the halves are added, then those of the sum, ..."""
+    while vector.size > 1:
+        vector = vector[:vector.size // 2] + vector[vector.size // 2:]
+    return vector[0]
+
+
+@intrinsic
+def _total(typing: Any, vector: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        rest = arguments[0]
+        while rest.type.count > 1:
+            half = rest.type.count // 2
+            rest = builder.fadd(*(builder.shuffle_vector(rest, rest, ir.Constant(
+                ir.VectorType(_INT, half), list(range(first, first + half)))) for first in (0, half)))
+        return builder.extract_element(rest, ir.Constant(_INT, 0))
+
+    return types.float32(vector), generate
+
+
+# Tiles
 
 def transpose_plain(source: Any, start: int, step: int, target: Any, target_start: int, target_step: int) -> None:
     """Transpose a tile of TILE×TILE values from one flat float32 array into another.
@@ -157,6 +406,15 @@ def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
 
 load: Any = load_plain if _PLAIN else _load
 store: Any = store_plain if _PLAIN else _store
-multiply: Any = multiply_plain if _PLAIN else _multiply
-multiply_add: Any = multiply_add_plain if _PLAIN else _multiply_add
+pairs: Any = pairs_plain if _PLAIN else _pairs
+fetch: Any = fetch_plain if _PLAIN else _fetch
+every: Any = every_plain if _PLAIN else _every
+ramp: Any = ramp_plain if _PLAIN else _ramp
+floats: Any = floats_plain if _PLAIN else _floats
+integers: Any = integers_plain if _PLAIN else _integers
+floor: Any = np.floor if _PLAIN else _floor
+where: Any = where_plain if _PLAIN else _where
+smaller: Any = smaller_plain if _PLAIN else _smaller
+larger: Any = larger_plain if _PLAIN else _larger
+total: Any = total_plain if _PLAIN else _total
 transpose: Any = transpose_plain if _PLAIN else _transpose
