@@ -54,10 +54,8 @@ RIDGE_DTYPE = np.dtype([
     ('alive', np.bool_),
 ])
 
-#: The gradient along a first guess is looked at in so many places, about.
-SAMPLES = 10
-#: For that, and to align it while it grows, one of at most SPARSEST steps of a line is looked at: of one longer than
-#: so many steps every second, and so on.
+#: To align it while it grows, one of at most SPARSEST steps of a line is looked at: of one longer than so many steps
+#: every second, and so on.
 ROUGH, SPARSEST = 16, 2
 #: Rounds of growing; in each but the last a line gets at most twice as long, and STEP at least at each end.
 ROUNDS, STEP = 3, 10.0
@@ -333,24 +331,20 @@ def within(
     return math.ceil(min(low, high + 1)), math.floor(high)
 
 
-@kernel
+@inlined
 def mean_response(line: Any, gradient: Any, axes: Axes) -> float:
-    """The mean gradient across a line, in some of the pixels along it; arguments as for :func:`align`."""
+    """The mean gradient across a line, in STEPS places along it at most; arguments as for :func:`align`."""
     low, high = within(line['slope'], line['intercept'], line['first'], line['last'], HALF, axes.size_p, axes.size_q)
     if high < low:
         return 0.0
-    stride = max((high - low) // SAMPLES, 1)
+    stride = 1 + (high - low) // STEPS
     n = (high - low) // stride + 1
     nx, ny = normal_of(line)
-    beyond, pixel = pixel_at(low, line, axes)
-    rise = np.float32(line['slope'] * stride)
-    response = every(0)
-    for k in range(0, n, STEPS):
-        there, s = steps(k, n)
-        r = integers(floor(rise * floats(s) + (beyond + HALF)))
-        at = across(gradient, s * (stride * axes.step_p) + r * axes.step_q + pixel, nx, ny)
-        response = response + where(there, at, ZERO)
-    return float(total(response)) / n
+    beyond, pixel = pixel_at(low + (high - low) % stride // 2, line, axes)
+    there, s = steps(0, n)
+    r = integers(floor(np.float32(line['slope'] * stride) * floats(s) + (beyond + HALF)))
+    at = across(gradient, s * (stride * axes.step_p) + r * axes.step_q + pixel, nx, ny)
+    return float(total(where(there, at, ZERO))) / n
 
 
 @inlined
