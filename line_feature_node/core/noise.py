@@ -69,11 +69,11 @@ def measure(
         keep: H×W, 0 where pixels don't count; None where all do.
     """
     scale, _ = intensity_map(image.dtype, parameters)
-    counts = buffers.array('noise counts', 2 * BINS, np.int64)[:2 * BINS].reshape(2, BINS)
-    total = count_differences(image, ALL if keep is None else keep, scale * RESOLUTION, counts)
+    sums = buffers.array('noise sums', 2 * BINS, np.int64)[:2 * BINS].reshape(2, BINS)
+    total = count_differences(image, ALL if keep is None else keep, scale * RESOLUTION, sums)
     if total == 0:
         return Quality(ROUNDING)
-    differences, gradients = np.cumsum(counts, axis=1)
+    differences, gradients = sums
     noise = max(quantile(differences, 0.5 * total) / (RESOLUTION * MEDIAN * GAIN), ROUNDING)
     strong, weak = (exceeded_by(share, gradients, total, noise) for share in (STRONG_SHARE, WEAK_SHARE))
     return Quality(noise, strong, weak)
@@ -109,7 +109,7 @@ def count(counts: Any, row: int, value: Any) -> None:
 
 @kernel
 def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
-    """Histograms of the absolute second differences and of the norms of Sobel's gradient, multiplied by the scale.
+    """Count absolute second differences, and norms of Sobel's gradient, of each size or less, multiplied by the scale.
 
     Pixels with a neighbour above or below that does not count, or that do not count themselves, are left out; `keep` is
     empty where all count.
@@ -141,6 +141,9 @@ def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
             count(counts, 0, abs(second) * factor)
             count(counts, 1, np.sqrt(across * across + along * along) * factor)
             total += 1
+    for k in range(1, BINS):
+        counts[0, k] += counts[0, k - 1]
+        counts[1, k] += counts[1, k - 1]
     return total
 
 

@@ -113,6 +113,8 @@ ARC = 0.273
 DIRECTIONS, IS_CLAIMED = 128, 128
 #: Claims count where the directions differ by at most so many steps, 25 degrees.
 SAME_DIRECTION = 9
+#: Lines are put into order by so many kinds of strengths; bits of a float that do not tell on them.
+KEYS, KEY_SHIFT = 1 << 13, 18
 #: How many lines before their turn what is along them is asked for, and they themselves are.
 AHEAD, FAR_AHEAD = 2, 10
 #: Pixels whose gradients, in whole numbers, come from memory together.
@@ -209,10 +211,10 @@ def refine_lines(
     gradient, pad, height, width, noise, step, correlation = ridges
     flat, stride = gradient.reshape(-1), gradient.shape[1]
     grown, strengths = joined_guesses(parts, buffers)
-    # The first bits of floats are in their order, and sorted faster, by counting.
-    order = np.argsort(~(strengths.view(np.uint32) >> 16).astype(np.uint16), kind='stable')
-    counts = buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS]
-    count_norms(gradient, pad, height, width, counts)
+    order = buffers.array('order', strengths.size, np.int64)[:strengths.size]
+    strongest_first(strengths.view(np.uint32), buffers.array('strength counts', KEYS, np.int64)[:KEYS], order)
+    rarities = buffers.array('rarities', NORM_BINS, np.float64)[:NORM_BINS]
+    rank_norms(gradient, pad, height, width, buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS], rarities)
     tests = 2 * math.log10(height * width)
     least = parameters.min_snr * noise, tests - math.log10(parameters.false_alarms)
     guesses, cells_twice = grown, 2 * -(-height // CELL) * -(-width // CELL)
@@ -220,7 +222,7 @@ def refine_lines(
     def grow_some(some: NDArray[np.int64], memory: Buffers) -> None:
         claims = memory.array('claims', cells_twice, np.uint8)[:cells_twice]
         values = memory.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
-        grow(some, guesses, counts, least, flat, stride, pad, height, width, noise, claims, values, grown)
+        grow(some, guesses, rarities, least, flat, stride, pad, height, width, noise, claims, values, grown)
 
     if team.size > 1:
         guesses = buffers.array('guesses', grown.size, RIDGE_DTYPE)[:grown.size]
@@ -229,9 +231,9 @@ def refine_lines(
         team.each(grow_some, [(order[(order >= first) & (order < end)],) for first, end in team.shares(grown.size)],
                   buffers.parts(team.size))
     grow_some(order, buffers)
-    kept = judge(least, counts, order, flat, stride, pad, height, width, grown)
+    kept = judge(least, rarities, order, flat, stride, pad, height, width, grown)
     segments = np.empty(kept, SEGMENT_DTYPE)
-    write(order, grown, step, correlation, tests, counts, segments)
+    write(order, grown, step, correlation, tests, rarities, segments)
     return segments
 
 
@@ -624,7 +626,7 @@ def lay(
 
 @kernel
 def grow(
-    order: Any, guesses: Any, counts: Any, least: tuple[float, float], gradient: Any, stride: int, pad: int,
+    order: Any, guesses: Any, rarities: Any, least: tuple[float, float], gradient: Any, stride: int, pad: int,
     height: int, width: int, noise: float, claims: Any, values: Any, grown: Any,
 ) -> None:
     """Let the first guesses that may become clear enough grow, in their order; those alive at the end are there once.
@@ -649,13 +651,13 @@ def grow(
         k = order[place]
         guess, line = guesses[k], grown[k]
         line['alive'] = False
-        if line['size'] == PENDING and not is_clear(guess, counts, HOPE * least[0], HOPE * least[1]):
+        if line['size'] == PENDING and not is_clear(guess, rarities, HOPE * least[0], HOPE * least[1]):
             line['size'] = 0
         if line['size'] == 0 or claimed(guess, claims, height, width) > CLAIMED:
             continue
         if line['size'] == PENDING:
             grown[k] = guess
-            grow_guess(line, counts, GROWN * least[0], GROWN * least[1], gradient,
+            grow_guess(line, rarities, GROWN * least[0], GROWN * least[1], gradient,
                        axes_of(line, stride, pad, height, width), noise, values)
         if line['size'] > 0 and leave(line, claims, height, width) <= REST_CLAIMED:
             line['alive'] = True
@@ -664,13 +666,13 @@ def grow(
 
 @inlined
 def grow_guess(
-    line: Any, counts: Any, least_strength: float, least_evidence: float, gradient: Any, axes: Axes, noise: float,
+    line: Any, rarities: Any, least_strength: float, least_evidence: float, gradient: Any, axes: Axes, noise: float,
     values: Any,
 ) -> None:
     """Let a first guess grow, and lay it along the peaks if it is as clear as that; its size is 0 if it is not."""
     grow_line(line, gradient, axes, noise, values)
     line['size'] = 0
-    if line['last'] - line['first'] >= SHORTEST_GROWING and is_clear(line, counts, least_strength, least_evidence):
+    if line['last'] - line['first'] >= SHORTEST_GROWING and is_clear(line, rarities, least_strength, least_evidence):
         settle(line, gradient, axes, noise, values)
 
 
@@ -815,6 +817,34 @@ def length_of(line: Any) -> float:
     return (line['last'] - line['first']) * math.sqrt(1 + line['slope'] * line['slope'])
 
 
+@kernel
+def strongest_first(bits: Any, counts: Any, order: Any) -> None:
+    """Put the places of numbers into order, the largest number first, by their first bits, which are counted.
+
+    Args:
+        bits: uint32, those of floats that are not negative.
+        counts: Memory for KEYS whole numbers.
+        order: Receives the places.
+    """
+    for key in range(KEYS):
+        counts[key] = 0
+    for place in range(bits.size):
+        counts[key_of(bits[place])] += 1
+    before = 0
+    for key in range(KEYS):
+        before, counts[key] = before + counts[key], before
+    for place in range(bits.size):
+        key = key_of(bits[place])
+        order[counts[key]] = place
+        counts[key] += 1
+
+
+@inlined
+def key_of(bits: Any) -> int:
+    """The smaller the number, the larger: the exponent of a float, and the first bits behind it."""
+    return KEYS - 1 - (np.int64(bits) >> KEY_SHIFT & KEYS - 1)
+
+
 @inlined
 def norm_bin(norm: float) -> int:
     """The bin of a norm; that of what is too large for all, or no number, is the last."""
@@ -822,10 +852,21 @@ def norm_bin(norm: float) -> int:
 
 
 @inlined
-def rarity(response: float, counts: Any) -> float:
-    """-log10 of the share of the picture's pixels with a gradient as strong; the counts are cumulative from the top."""
-    share = counts[norm_bin(response)] / max(counts[0], 1)
-    return -math.log10(max(share, RAREST))
+def rarity(response: float, rarities: Any) -> float:
+    """-log10 of the share of the picture's pixels with a gradient as strong."""
+    return float(rarities[norm_bin(response)])
+
+
+@kernel
+def rank_norms(gradient: Any, pad: int, height: int, width: int, counts: Any, rarities: Any) -> None:
+    """How rare norms are, by their bins."""
+    count_norms(gradient, pad, height, width, counts)
+    count, rare = 0, -math.log10(RAREST)
+    for k in range(counts.size - 1, -1, -1):
+        if counts[k] != count:
+            count = counts[k]
+            rare = -math.log10(max(count / counts[0], RAREST))
+        rarities[k] = rare
 
 
 @kernel
@@ -847,7 +888,7 @@ def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -
 
 
 @inlined
-def is_clear(line: Any, counts: Any, least_strength: float, least_evidence: float) -> bool:
+def is_clear(line: Any, rarities: Any, least_strength: float, least_evidence: float) -> bool:
     """Whether neither noise nor chance makes a line as clear as this.
 
     Were the gradients of the picture spread over it without order, a line of length l along which they are as strong as
@@ -856,49 +897,47 @@ def is_clear(line: Any, counts: Any, least_strength: float, least_evidence: floa
 
     Args:
         line: The line.
-        counts: Of the norms.
+        rarities: Of the norms.
         least_strength: What its response by root of length must be.
         least_evidence: What -l log10 H must be.
     """
     length = length_of(line)
     return (line['response'] * math.sqrt(length) >= least_strength
-            and length * rarity(line['response'], counts) >= least_evidence)
+            and length * rarity(line['response'], rarities) >= least_evidence)
 
 
 @kernel
 def judge(
-    least: tuple[float, float], counts: Any, order: Any, gradient: Any, stride: int, pad: int, height: int, width: int,
-    grown: Any,
+    least: tuple[float, float], rarities: Any, order: Any, gradient: Any, stride: int, pad: int, height: int,
+    width: int, grown: Any,
 ) -> int:
-    """Drop the lines that are too short or not clear enough; return how many are left.
+    """Drop the lines that are too short or not clear enough from the order; return how many are left.
 
     What a line left to others does not count: it is judged, and told of, by what there is along the rest.
     """
     left = 0
-    for k in order:
-        line = grown[k]
+    for place in range(order.size):
+        if place + FAR_AHEAD < order.size:
+            fetch(grown, order[place + FAR_AHEAD])
+        line = grown[order[place]]
         if not line['alive']:
             continue
         if line['begin'] > line['first'] or line['end'] < line['last']:
             line['first'], line['last'], line['size'] = line['begin'], line['end'], 0
             align_to_peaks(line, gradient, axes_of(line, stride, pad, height, width), 0.0)
-        line['alive'] = line['size'] > 0 and length_of(line) >= SHORTEST and is_clear(line, counts, least[0], least[1])
-        left += line['alive']
+        if line['size'] > 0 and length_of(line) >= SHORTEST and is_clear(line, rarities, least[0], least[1]):
+            order[left] = order[place]
+            left += 1
     return left
 
 
 @kernel
 def write(
-    order: Any, grown: Any, step: float, correlation: float, tests: float, counts: Any, segments: Any,
+    order: Any, grown: Any, step: float, correlation: float, tests: float, rarities: Any, segments: Any,
 ) -> None:
     """Fill in the records that users get."""
-    count = 0
-    for k in order:
-        line = grown[k]
-        if not line['alive']:
-            continue
-        segment = segments[count]
-        count += 1
+    for count in range(segments.size):
+        line, segment = grown[order[count]], segments[count]
         slope, first, last = line['slope'], line['first'], line['last']
         scale = 1 / math.sqrt(1 + slope * slope)
         q1, q2 = slope * first + line['intercept'], slope * last + line['intercept']
@@ -915,12 +954,11 @@ def write(
         segment['x'], segment['y'], segment['z'] = x, y, 0
         segment['x1'], segment['y1'], segment['x2'], segment['y2'] = x1, y1, x2, y2
         segment['length'] = length_of(line)
-        segment['theta'] = math.atan2(sin, cos)
+        theta = segment['theta'] = math.atan2(sin, cos)
         segment['intercept'] = y - sin / cos * x if cos >= VERTICAL else np.nan
         segment['rho'] = y * cos - x * sin
-        # The code of the gradient's direction: its sections are centred on multiples of 45 degrees.
-        section = math.floor(math.atan2(cos, -sin) / (np.pi / 4) + 0.5) % 4
-        segment['code'] = section + 1
+        # The code of the gradient's direction, a quarter of a turn on, by sections about multiples of 45 degrees.
+        segment['code'] = math.floor(theta / (np.pi / 4) + 2.5) % 4 + 1
         segment['size'] = line['size']
         # Noise of neighbouring peaks is smoothed along the edge: so many of them count as one.
         together = max(INDEPENDENT * correlation * scale, 1.0)
@@ -929,4 +967,4 @@ def write(
         segment['sigma_offset'] = math.sqrt(together * variance / line['size']) * scale
         segment['contrast'] = line['response'] / step
         segment['polarity'] = -line['sign'] if line['steep'] and not turned else line['sign']
-        segment['log_nfa'] = tests - length_of(line) * rarity(line['response'], counts)
+        segment['log_nfa'] = tests - length_of(line) * rarity(line['response'], rarities)
