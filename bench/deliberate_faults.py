@@ -116,7 +116,7 @@ FAULTS = {
         ('at_first += hits > count', 'at_first += hits >= count'),
         ("-line['sign'] if line['steep'] and not turned", "-line['sign'] if line['steep']"),
         ('(np.pi / 4) + 2.5)', '(np.pi / 4) + 1.5)'),
-        ('KEYS - 1 - (np.int64(bits) >> KEY_SHIFT & KEYS - 1)', '(np.int64(bits) >> KEY_SHIFT & KEYS - 1)'),
+        ('KEYS - 1 - (int(bits) >> KEY_SHIFT & KEYS - 1)', '(int(bits) >> KEY_SHIFT & KEYS - 1)'),
         ('counts[k] != count', 'counts[k] == count'),
         ('* scale * scale', '* scale'),
         ('(most - intercept) / slope', '(most + intercept) / slope'),
@@ -153,7 +153,8 @@ FAULTS = {
         ('first + min(end * UNIT, size)', 'first + end * UNIT'),
         ('end - unit < LONGEST', 'end - unit <= LONGEST'),
         ('stop - start < min_size', 'stop - start <= min_size'),
-        ('(size + UNIT - 1) // UNIT, n, sx', 'size // UNIT, n, sx'),
+        ('np.int64(1) - bridged[k]', 'np.int64(1)'),
+        ('UNIT * unit, UNIT, sums', 'UNIT * unit, UNIT - 1, sums'),
         ('+ (NOISE_DEVIATION', '- (NOISE_DEVIATION'),
     ],
     'team': [

@@ -20,5 +20,5 @@ def position(pixel: int, inverse: float, stride: int) -> tuple[Any, Any]:
 
     The product replaces a slow division; half a pixel keeps it off whole numbers, where rounding would matter.
     """
-    row = np.int64((pixel + 0.5) * inverse)
+    row = np.int32((pixel + 0.5) * inverse)
     return row, pixel - row * stride

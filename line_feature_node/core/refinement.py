@@ -842,7 +842,7 @@ def strongest_first(bits: Any, counts: Any, order: Any) -> None:
 @inlined
 def key_of(bits: Any) -> int:
     """The smaller the number, the larger: the exponent of a float, and the first bits behind it."""
-    return KEYS - 1 - (np.int64(bits) >> KEY_SHIFT & KEYS - 1)
+    return KEYS - 1 - (int(bits) >> KEY_SHIFT & KEYS - 1)
 
 
 @inlined

@@ -60,24 +60,39 @@ def split_chains(
     moments = buffers.array('moments', MOMENTS * most, np.float64)[:MOMENTS * most].reshape(most, MOMENTS)
     units = size // UNIT + 2
     sums = buffers.array('sums', MOMENTS * units, np.float64)[:MOMENTS * units].reshape(units, MOMENTS)
-    count = split(chains.offsets, chains.pixels, chains.codes, chains.bridged, 1 / variance, stride, margin, min_size,
-                  sums, attributes, members, offsets, moments)
+    columns, rows = buffers.array('columns', size, np.int32), buffers.array('rows', size, np.int32)
+    first, last = chains.offsets[0], chains.offsets[-1]
+    place_pixels(chains.pixels[first:last], stride, margin, columns, rows)
+    count = split(chains.offsets, columns, rows, chains.codes[first:last], chains.bridged[first:last], 1 / variance,
+                  min_size, sums, attributes, members, offsets, moments)
     return Blobs(attributes[:count], members[:offsets[count]], offsets[:count + 1], moments[:count])
 
 
 @kernel
+def place_pixels(pixels: Any, stride: int, margin: int, columns: Any, rows: Any) -> None:
+    """Columns and rows of pixels: by themselves, as the compiler makes vectors of that."""
+    inverse = 1 / stride
+    for k in range(pixels.size):
+        row, column = position(pixels[k], inverse, stride)
+        columns[k], rows[k] = column - margin, row - margin
+
+
+@kernel
 def split(
-    chain_offsets: Any, pixels: Any, codes: Any, bridged: Any, weight: float, stride: int, margin: int, min_size: int,
-    sums: Any, blobs: Any, members: Any, offsets: Any, moments: Any,
+    chain_offsets: Any, columns: Any, rows: Any, codes: Any, bridged: Any, weight: float, min_size: int, sums: Any,
+    blobs: Any, members: Any, offsets: Any, moments: Any,
 ) -> int:
-    """Divide every chain, and write out its stretches; return their number."""
-    count, total = 0, 0
+    """Divide every chain, and write out its stretches; return their number.
+
+    Columns, rows, codes and whether they fill a gap are those of the chains' pixels, from the first chain's on.
+    """
+    count, total, start_of_all = 0, 0, chain_offsets[0]
     offsets[0] = 0
     for chain in range(chain_offsets.size - 1):
-        first, size = chain_offsets[chain], chain_offsets[chain + 1] - chain_offsets[chain]
+        first, size = chain_offsets[chain] - start_of_all, chain_offsets[chain + 1] - chain_offsets[chain]
         if size < max(min_size, UNIT * (FIRST - 1) + 1):
             continue
-        sum_up(first, size, pixels, bridged, stride, margin, sums)
+        sum_up(columns[first:first + size], rows[first:first + size], bridged[first:first + size], sums)
         units = (size + UNIT - 1) // UNIT
         unit = 0
         while unit + FIRST <= units:
@@ -91,44 +106,53 @@ def split(
             unit = end
             if stop - start < min_size:
                 continue
-            describe(pixels, codes, start, stop, stride, margin, blobs[count])
-            for pixel in range(start, stop):
-                members[total] = pixel
-                total += 1
+            describe(columns[start:stop], rows[start:stop], codes[start:stop], blobs[count])
+            for k in range(stop - start):
+                members[total + k] = start_of_all + start + k
+            total += stop - start
             count += 1
             offsets[count] = total
     return count
 
 
 @inlined
-def sum_up(first: int, size: int, pixels: Any, bridged: Any, stride: int, margin: int, sums: Any) -> None:
+def sum_up(columns: Any, rows: Any, bridged: Any, sums: Any) -> None:
     """The moments of a chain up to each unit; filled gaps don't count."""
-    inverse = 1 / stride
+    size = columns.size
+    for k in range(MOMENTS):
+        sums[0, k] = 0
+    for unit in range(size // UNIT):
+        add_unit(columns, rows, bridged, UNIT * unit, UNIT, sums, unit)
+    if size % UNIT > 0:
+        add_unit(columns, rows, bridged, size // UNIT * UNIT, size % UNIT, sums, size // UNIT)
+
+
+@inlined
+def add_unit(columns: Any, rows: Any, bridged: Any, first: int, size: int, sums: Any, unit: int) -> None:
+    """The moments up to the end of a unit, from those up to its beginning."""
     n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
-    for k in range(size):
-        if k % UNIT == 0:
-            put_down(sums, k // UNIT, n, sx, sy, sxx, sxy, syy)
-        if bridged[first + k]:
-            continue
-        row, column = position(pixels[first + k], inverse, stride)
-        x, y = column - margin, row - margin
-        n, sx, sy, sxx, sxy, syy = n + 1, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
-    put_down(sums, (size + UNIT - 1) // UNIT, n, sx, sy, sxx, sxy, syy)
+    for k in range(first, first + size):
+        there = np.int64(1) - bridged[k]
+        x, y = np.int64(columns[k]), np.int64(rows[k])
+        n, sx, sy = n + there, sx + there * x, sy + there * y
+        sxx, sxy, syy = sxx + there * x * x, sxy + there * x * y, syy + there * y * y
+    put_down(sums, unit + 1, n + sums[unit, 0], sx + sums[unit, 1], sy + sums[unit, 2], sxx + sums[unit, 3],
+             sxy + sums[unit, 4], syy + sums[unit, 5])
 
 
 @inlined
 def scatter(sums: Any, first: int, last: int) -> float:
     """Sum of squared distances of the pixels of some units from their line: the smaller eigenvalue of their scatter.
 
-    It is taken as the determinant over the trace, which is that but for the share that it has of the larger one.
+    It is taken as the determinant over the trace, which is that but for the share that it has of the larger one. The
+    central moments are multiplied by the number of pixels, which makes them whole numbers, and a division less.
     """
     n = sums[last, 0] - sums[first, 0]
-    per_pixel = 1 / max(n, 1.0)
     x, y = sums[last, 1] - sums[first, 1], sums[last, 2] - sums[first, 2]
-    xx = sums[last, 3] - sums[first, 3] - x * x * per_pixel
-    xy = sums[last, 4] - sums[first, 4] - x * y * per_pixel
-    yy = sums[last, 5] - sums[first, 5] - y * y * per_pixel
-    return max(xx * yy - xy * xy, 0.0) / max(xx + yy, LEAST_TRACE)
+    xx = n * (sums[last, 3] - sums[first, 3]) - x * x
+    xy = n * (sums[last, 4] - sums[first, 4]) - x * y
+    yy = n * (sums[last, 5] - sums[first, 5]) - y * y
+    return max(xx * yy - xy * xy, 0.0) / (max(n, 1.0) * max(xx + yy, LEAST_TRACE * n, LEAST_TRACE))
 
 
 @kernel
@@ -148,21 +172,18 @@ def end_of_stretch(sums: Any, unit: int, units: int, weight: float) -> int:
 
 
 @inlined
-def describe(pixels: Any, codes: Any, start: int, stop: int, stride: int, margin: int, blob: Any) -> None:
+def describe(columns: Any, rows: Any, codes: Any, blob: Any) -> None:
     """Fill in the attributes of a stretch; of codes that are equally frequent the lower one counts."""
-    inverse = 1 / stride
-    top, left = position(pixels[start], inverse, stride)
-    bottom, right = top, left
+    left, right, top, bottom = columns[0], columns[0], rows[0], rows[0]
     counts: Any = np.int64(0)
-    for k in range(start, stop):
-        row, column = position(pixels[k], inverse, stride)
-        top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
+    for k in range(columns.size):
+        left, right = min(left, columns[k]), max(right, columns[k])
+        top, bottom = min(top, rows[k]), max(bottom, rows[k])
         counts += 1 << 15 * (np.int64(codes[k]) - 1)
     most: Any = -1
     for code in range(1, 5):
         if counts >> 15 * (code - 1) & 0x7FFF > most:
             most = counts >> 15 * (code - 1) & 0x7FFF
             blob['dir'] = code
-    blob['select'], blob['size'] = True, stop - start
-    blob['min_row'], blob['max_row'] = top - margin, bottom - margin
-    blob['min_col'], blob['max_col'] = left - margin, right - margin
+    blob['select'], blob['size'] = True, columns.size
+    blob['min_row'], blob['max_row'], blob['min_col'], blob['max_col'] = top, bottom, left, right
