@@ -323,7 +323,11 @@ def start_weights(q: Any, k: int) -> tuple[Any, Any, Any]:
 
 @inlined
 def recur(y: Any, y1: Any, y2: Any, q: Any) -> None:
-    """One step of y = (1 - q)^2 x + 2 q y1 - q^2 y2, elementwise and in place of x: (n + 1) q^n, half of E * E."""
+    """One step of y = (1 - q)^2 x + 2 q y1 - q^2 y2, elementwise and in place of x: (n + 1) q^n, half of E * E.
+
+    The weights are in double precision, as 1 and 2 are whole numbers, and so is the sum: with single precision, which
+    would save 1 % of all time, large grey levels lose their edges, and where parts of a picture meet bits differ.
+    """
     gain, first, second = (1 - q) * (1 - q), 2 * q, -q * q
     for i in range(y.size):
         y[i] = first * y1[i] + (second * y2[i] + gain * y[i])
