@@ -87,6 +87,8 @@ def _fan(longest: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 NEXT_STATE = _next_state()
+#: The place of the lowest bit of a mask.
+LOWEST = np.array([0, *((mask & -mask).bit_length() - 1 for mask in range(1, 256))], np.int64)
 
 
 @lru_cache(maxsize=8)
@@ -231,9 +233,7 @@ def next_start(
     while True:
         mask = open_neighbours(marks, beside, stride) >> direction
         if mask != 0:
-            while mask & 1 == 0:
-                mask >>= 1
-                direction += 1
+            direction += LOWEST[mask]
             return beside + STEP_X[direction] + stride * STEP_Y[direction], beside, direction + 1, top
         if top == 0:
             return -1, beside, direction, top
@@ -257,8 +257,7 @@ def trace_chain(
     alone = mask == 0
     if not alone:
         length, top = walk(start, (direction + 4) % 8, mask, marks, stride, moves, pixels, codes, length, stack, top)
-        reverse(pixels, first, length)
-        reverse(codes, first, length)
+        reverse(pixels, codes, first, length)
     pixels[length] = start
     codes[length] = code
     length += 1
@@ -321,11 +320,12 @@ def opening(mark: int, direction: int) -> Any:
 
 
 @inlined
-def reverse(values: Any, first: int, end: int) -> None:
-    """Turn round values[first:end] in place."""
+def reverse(pixels: Any, codes: Any, first: int, end: int) -> None:
+    """Turn round the pixels from the first to the end, and their codes, in place."""
     last = end - 1
     while first < last:
-        values[first], values[last] = values[last], values[first]
+        pixels[first], pixels[last] = pixels[last], pixels[first]
+        codes[first], codes[last] = codes[last], codes[first]
         first += 1
         last -= 1
 
@@ -494,8 +494,7 @@ def append(
     for k in range(last - first):
         codes[length + k] = raw_codes[first + k]
     if end % 2 == 1:
-        reverse(pixels, length, total)
-        reverse(codes, length, total)
+        reverse(pixels, codes, length, total)
     return total
 
 
