@@ -646,8 +646,10 @@ def grow(
         if place + FAR_AHEAD < order.size:
             fetch(guesses, order[place + FAR_AHEAD])
         if place + AHEAD < order.size:
-            next_one = guesses[order[place + AHEAD]]
-            fetch_along(next_one, gradient, axes_of(next_one, stride, pad, height, width), claims, height, width)
+            later = order[place + AHEAD]
+            if grown[later]['size'] == PENDING:
+                fetch_along(guesses[later], gradient, axes_of(guesses[later], stride, pad, height, width), claims,
+                            height, width)
         k = order[place]
         guess, line = guesses[k], grown[k]
         line['alive'] = False
