@@ -116,7 +116,7 @@ def principal_axis(mu20: float, mu11: float, mu02: float) -> tuple[float, float]
     cancels and horizontal and vertical lines are exact.
     """
     difference = mu20 - mu02
-    r = np.hypot(2 * mu11, difference)
+    r = np.sqrt(4 * mu11 * mu11 + difference * difference)
     if r == 0:
         return 0.0, 0.0
     if difference >= 0:
@@ -209,7 +209,7 @@ def write_segments(lines: Any, alive: Any, segments: Any) -> None:
             cos, sin, x1, y1, x2, y2 = -cos, -sin, x2, y2, x1, y1
         segment['x'], segment['y'], segment['z'] = line['x'], line['y'], 0
         segment['x1'], segment['y1'], segment['x2'], segment['y2'] = x1, y1, x2, y2
-        segment['length'] = np.hypot(x2 - x1, y2 - y1)
+        segment['length'] = np.sqrt((x2 - x1) * (x2 - x1) + (y2 - y1) * (y2 - y1))
         segment['theta'] = np.arctan2(sin, cos)
         segment['intercept'] = line['y'] - sin / cos * line['x'] if cos >= VERTICAL else np.nan
         segment['rho'] = line['y'] * cos - line['x'] * sin
