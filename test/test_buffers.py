@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from line_feature_node.core import LineFeatureExtractor
 from line_feature_node.core.buffers import Buffers
@@ -49,3 +50,12 @@ def test_the_hot_path_allocates_nothing():
     for frame in noise:
         extractor.extract(frame)
     assert {name: id(array) for name, array in extractor._buffers._arrays.items()} == before
+
+
+def test_two_things_of_one_name_are_told():
+    """One would be written over by the other, and kernels compiled for the wrong type."""
+    buffers = Buffers()
+    buffers.array('rows', 10, np.float32)
+    with pytest.raises(TypeError, match=r'rows was an array of float32, and is asked for as one of int32'):
+        buffers.array('rows', 5, np.int32)
+    assert buffers.array('rows', 5, np.float32).size >= 10

@@ -25,8 +25,14 @@ class Buffers:
         return self._parts[:count]
 
     def array(self, name: str, size: int, dtype: DTypeLike, *, zeros: bool = False) -> NDArray[Any]:
-        """A one-dimensional array of at least that size, always the same one until a larger one is needed."""
+        """A one-dimensional array of at least that size, always the same one until a larger one is needed.
+
+        Raises:
+            TypeError: It was asked for with another type before: two things have one name.
+        """
         array = self._arrays.get(name)
+        if array is not None and array.dtype != dtype:
+            raise TypeError(f'{name} was an array of {array.dtype}, and is asked for as one of {np.dtype(dtype)}')
         if array is None or array.size < size:
             # A video's frames differ a little: room to grow saves most of them from allocating.
             room = size + size // 4

@@ -60,7 +60,8 @@ def split_chains(
     moments = buffers.array('moments', MOMENTS * most, np.float64)[:MOMENTS * most].reshape(most, MOMENTS)
     units = size // UNIT + 2
     sums = buffers.array('sums', MOMENTS * units, np.float64)[:MOMENTS * units].reshape(units, MOMENTS)
-    columns, rows = buffers.array('columns', size, np.int32), buffers.array('rows', size, np.int32)
+    columns = buffers.array('pixel columns', size, np.int32)
+    rows = buffers.array('pixel rows', size, np.int32)
     first, last = chains.offsets[0], chains.offsets[-1]
     place_pixels(chains.pixels[first:last], stride, margin, columns, rows)
     count = split(chains.offsets, columns, rows, chains.codes[first:last], chains.bridged[first:last], 1 / variance,
