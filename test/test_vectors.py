@@ -91,7 +91,7 @@ def arithmetic(a: Any, b: Any, number: float, results: Any) -> None:
     vectors.store(results, 80, vectors.larger(x, y))
     vectors.store(results, 88, vectors.larger(x, number))
     vectors.store(results, 96, vectors.where(x < y, x, number))
-    vectors.store(results, 104, vectors.where((x <= y) & (y >= number), x, y))
+    vectors.store(results, 104, vectors.where((x <= y) & (y >= number), vectors.every(1), 0))
     vectors.store(results, 112, vectors.every(vectors.total(x)))
     results[120] = vectors.total(y)
 
@@ -101,8 +101,8 @@ def plain_arithmetic(a: Floats, b: Floats, number: float) -> Floats:
     results = [x + y, x - y, x * y, x / y, abs(x), number - x, x * number, np.floor(x),
                vectors.floats_plain(vectors.integers_plain(x)), vectors.smaller_plain(x, y), vectors.larger_plain(x, y),
                vectors.larger_plain(x, number), vectors.where_plain(x < y, x, number),
-               vectors.where_plain((x <= y) & (y >= number), x, y), vectors.every_plain(vectors.total_plain(x)),
-               vectors.total_plain(y)]
+               vectors.where_plain((x <= y) & (y >= number), vectors.every_plain(1), 0),
+               vectors.every_plain(vectors.total_plain(x)), vectors.total_plain(y)]
     return np.hstack(results).astype(np.float32)
 
 
