@@ -107,7 +107,7 @@ FAULTS = {
     ],
     'refinement': [
         ('(total(sd) - total(slant) / second) / n', '(total(sd) + total(slant) / second) / n'),
-        ('r - q - first / second', 'r - q + first / second'),
+        ('r - q - first / where', 'r - q + first / where'),
         ('shift - turn * middle', 'shift + turn * middle'),
         ('(low, high) if way == 1 else (-high, -low)', '(low, high) if way == 1 else (-low, -high)'),
         ("(0.0 if line['sign'] > 0 else math.pi) - angle", "(0.0 if line['sign'] > 0 else math.pi) + angle"),
@@ -172,7 +172,7 @@ FAULTS = {
     'vectors': [
         ('k + distance if not k & distance else TILE + k', 'k if not k & distance else TILE + k'),
         ('builder.fadd(', 'builder.fsub('),
-        ("_comparison('<='), _MASK", "_comparison('<'), _MASK"),
+        ("_comparison('<='), compares", "_comparison('<'), compares"),
         ('list(range(STEPS))', 'list(range(1, STEPS + 1))'),
         ('ir.Constant(both.type, [bits] * STEPS)', 'ir.Constant(both.type, [bits - 1] * STEPS)'),
         ('target_start + column * target_step + row', 'target_start + row * target_step + column'),

@@ -11,7 +11,7 @@ import numpy as np
 
 from line_feature_node.core.compiling import kernel
 from line_feature_node.core.edges import smooth_strip, turn, turn_back
-from line_feature_node.core.refinement import MOVE, RIDGE_DTYPE, align, axes_of
+from line_feature_node.core.refinement import RIDGE_DTYPE, align, axes_of
 from line_feature_node.core.vectors import LANES, TILE
 
 WIDTH, HEIGHT, STRIDE, STRIPS, REPS = 640, 480, 656, 480 // LANES, 200
@@ -51,9 +51,9 @@ def turn_back_plain(strip: Any, plane: Any, first: int) -> None:
 
 @kernel
 def align_all(lines: Any, gradient: Any, stride: int) -> None:
-    """Align lines."""
+    """Align lines, which may not move, so that they are the same ones every time."""
     for line in lines:
-        align(line, gradient, axes_of(line, stride, 2, HEIGHT, WIDTH), MOVE)
+        align(line, gradient, axes_of(line, stride, 2, HEIGHT, WIDTH), 0.0)
 
 
 @kernel
@@ -83,7 +83,7 @@ def align_all_plain(lines: Any, gradient: Any, stride: int) -> None:
 
 
 def lines_anywhere(seed: int = 0) -> tuple[Any, Any]:
-    """Lines in a picture without edges, which stay where they are, and its gradient."""
+    """Lines in a picture of noise, and its gradient."""
     rng = np.random.default_rng(seed)
     lines = np.zeros(LINES, RIDGE_DTYPE)
     lines['steep'], lines['slope'], lines['sign'] = rng.random(LINES) < 0.5, rng.uniform(-0.5, 0.5, LINES), 1

@@ -205,3 +205,13 @@ def test_frame_after_frame() -> None:
         image = rng.integers(0, 5, shape).astype(np.uint8)
         assert listed(*extract(image, shuffled, buffers=buffers)) == reference(image)
         assert not buffers.array('colours', 1, np.int32, zeros=True).any()
+
+
+def test_moments_of_large_pictures_are_exact() -> None:
+    """Also as plain Python, where whole numbers of 32 bits would overflow."""
+    stride = 1936
+    pixels = (1071 * stride + np.arange(1, 1901)).astype(np.int32)
+    codes, bridged = np.full(1900, 3, np.uint8), np.zeros(1900, np.bool_)
+    blobs = extract_blobs(pixels, codes, bridged, (1082, stride), 1, Buffers())
+    x, y = np.arange(1900, dtype=object), np.full(1900, 1070, dtype=object)
+    assert blobs.moments.tolist() == [[1900, x.sum(), y.sum(), (x * x).sum(), (x * y).sum(), (y * y).sum()]]

@@ -19,13 +19,18 @@ from test_pipeline import half_plane, scene
 from line_feature_node.core import SEGMENT_DTYPE, LineFeatureExtractor, end_points, extract
 from line_feature_node.core.refinement import (
     COUNT_COLUMNS,
+    KEY_SHIFT,
+    KEYS,
     NORM_BIN,
     NORM_BINS,
+    RAREST,
     RIDGE_DTYPE,
     claim,
     claimed,
     count_norms,
     leave,
+    rank_norms,
+    strongest_first,
     within,
 )
 
@@ -662,6 +667,27 @@ def test_norms_are_counted_from_the_top() -> None:
     assert counts.tolist() == [np.count_nonzero(norms >= NORM_BIN * k) for k in range(NORM_BINS)]
 
 
+def test_rarity_of_a_norm_is_the_share_of_those_as_large() -> None:
+    gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
+    counts, rarities = np.ones(NORM_BINS, np.int64), np.ones(NORM_BINS)
+    rank_norms(gradient, 2, 36, 46, counts, rarities)
+    assert len(set(counts.tolist())) > 50
+    np.testing.assert_allclose(rarities, -np.log10(np.maximum(counts / counts[0], RAREST)), rtol=1e-12)
+
+
+def test_strongest_come_first() -> None:
+    """By the first bits, and equal ones in the order of the list; also what is no number has its place."""
+    strengths = np.random.default_rng(0).lognormal(3, 2, 500).astype(np.float32)
+    strengths[[3, 40, 400, 401, 402]] = np.inf, 0, 0, np.nan, 1e-40
+    strengths[100:110] = strengths[100]
+    order, bits = np.full(500, -1, np.int64), strengths.view(np.uint32)
+    strongest_first(bits, np.ones(KEYS, np.int64), order)
+    np.testing.assert_array_equal(order, np.argsort(-(bits.astype(np.int64) >> KEY_SHIFT), kind='stable'))
+    ordered = strengths[order]
+    assert np.isnan(ordered[0])
+    assert (ordered[2:-4] >= 0.969 * ordered[3:-3]).all()
+
+
 @pytest.mark.parametrize('period', [3, 4, 5, 8])
 @pytest.mark.parametrize('size', [160, 600, 1200])
 @pytest.mark.parametrize('turned', [False, True])
@@ -713,7 +739,7 @@ def ridge(first: float, last: float, sign: float = 1.0, steep: bool = False, int
 @pytest.mark.parametrize('steep', [False, True])
 @pytest.mark.parametrize(('ends', 'kept', 'share'), [
     ((20, 120), (50, 120), 0), ((0, 40), (0, 10), 0), ((60, 120), (60, 120), 0), ((51, 90), (51, 90), 0.05),
-    ((0, 100), (0, 100), 0.41), ((20, 40), None, 1)])
+    ((0, 100), (0, 100), 0.41), ((20, 40), None, 1), ((8, 40), (8, 10), 0)])
 def test_a_line_leaves_its_ends_to_those_who_claim_them(
     ends: tuple[float, float], kept: tuple[float, float] | None, share: float, steep: bool,
 ) -> None:

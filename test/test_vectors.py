@@ -175,6 +175,13 @@ def test_pairs(dtype: Any) -> None:
     np.testing.assert_array_equal(results, np.hstack(vectors.pairs_plain(array, index.astype(np.int32))))
 
 
+def test_plain_vectors_are_in_the_array() -> None:
+    """As where bounds are checked."""
+    for index in (-1, 1):
+        with pytest.raises(IndexError):
+            vectors.load_plain(values(LANES), index)
+
+
 def test_plain_pairs_are_in_the_array() -> None:
     """What the compiler would read from elsewhere is an error."""
     for first in (-1, 8):
@@ -194,6 +201,16 @@ def test_anything_can_be_asked_for(dtype: Any, index: int) -> None:
     ask(array, index)
     vectors.fetch_plain(array, index)
     assert array.tobytes() == bytes(array.nbytes)
+
+
+@pytest.mark.compiled
+def test_what_is_asked_for_is_asked_for() -> None:
+    """All cache lines that an item may be in; nothing else shows that, but time."""
+    ask(np.zeros(4, np.uint8), 0)
+    ask(np.zeros(4, np.dtype([('a', np.float64, 11), ('b', np.int16)])), 0)
+    calls = [text.count('call void @llvm.prefetch') for text in ask.inspect_llvm().values()]
+    assert min(calls) == 1
+    assert max(calls) >= 3
 
 
 BOUNDS = """
@@ -224,7 +241,7 @@ for function, last in ((load, 256), (store, 256), (pairs, 136), (turn, 32)):
 def test_bounds_of_vectors_are_checked_where_those_of_arrays_are(tmp_path: Path) -> None:
     root = str(Path(__file__).parents[1])
     run = subprocess.run([sys.executable, '-c', BOUNDS], capture_output=True, text=True, check=False, env=os.environ | {
-        'NUMBA_BOUNDSCHECK': '1', 'NUMBA_CACHE_DIR': str(tmp_path),
+        'NUMBA_BOUNDSCHECK': '1', 'NUMBA_DISABLE_JIT': '0', 'NUMBA_CACHE_DIR': str(tmp_path),
         'PYTHONPATH': os.pathsep.join([root, os.environ.get('PYTHONPATH', '')])})
     assert run.returncode == 0, run.stderr[-2000:]
 

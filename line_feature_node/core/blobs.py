@@ -177,7 +177,7 @@ def sum_up(
             if bridged[k]:
                 continue
             row, column = position(pixels[k], inverse, stride)
-            x, y = column - margin, row - margin
+            x, y = int(column - margin), int(row - margin)
             n, sx, sy, sxx, sxy, syy = n + 1, sx + x, sy + y, sxx + x * x, sxy + x * y, syy + y * y
         put_down(moments, label, n, sx, sy, sxx, sxy, syy)
 

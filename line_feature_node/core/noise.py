@@ -108,7 +108,7 @@ def count(counts: Any, row: int, value: Any) -> None:
 
 
 @kernel
-def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
+def count_differences(image: Any, keep: Any, scale: float, sums: Any) -> int:
     """Count absolute second differences, and norms of Sobel's gradient, of each size or less, multiplied by the scale.
 
     Pixels with a neighbour above or below that does not count, or that do not count themselves, are left out; `keep` is
@@ -120,7 +120,7 @@ def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
     height, width = image.shape
     factor = np.float32(scale)
     for k in range(BINS):
-        counts[0, k], counts[1, k] = 0, 0
+        sums[0, k], sums[1, k] = 0, 0
     total = 0
     every, turns = max(height // ROWS, EVERY), max(width // COLUMNS, 1)
     for row in range(max(min(1 + every // 2, height // 2), 1), height - 1, every):
@@ -138,12 +138,12 @@ def count_differences(image: Any, keep: Any, scale: float, counts: Any) -> int:
             across = right - left + 2 * (east - west)
             along = (np.float32(below[i - 1]) - np.float32(above[i - 1]) + np.float32(below[i + 1])
                      - np.float32(above[i + 1]) + 2 * (np.float32(below[i]) - np.float32(above[i])))
-            count(counts, 0, abs(second) * factor)
-            count(counts, 1, np.sqrt(across * across + along * along) * factor)
+            count(sums, 0, abs(second) * factor)
+            count(sums, 1, np.sqrt(across * across + along * along) * factor)
             total += 1
     for k in range(1, BINS):
-        counts[0, k] += counts[0, k - 1]
-        counts[1, k] += counts[1, k - 1]
+        sums[0, k] += sums[0, k - 1]
+        sums[1, k] += sums[1, k - 1]
     return total
 
 

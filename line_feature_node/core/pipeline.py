@@ -43,8 +43,9 @@ Watch = Callable[[str, Any], None]
 LEAST_SHARED = 2**19
 #: Parts in which a team has edges traced.
 PARTS = 8
-#: Pixels an image may have: positions are 32-bit numbers.
-MOST_PIXELS = 2**30
+#: Pixels an image may have: positions are 32-bit numbers, also in the border of so many rows or columns, or less, that
+#: an image gets.
+MOST_PIXELS, BORDER = 2**30, 64
 #: Parameters that between them use all kernels.
 ALL_KERNELS = (Parameters(), Parameters.paper(), Parameters(threads=2), Parameters(operator='sobel'))
 
@@ -413,8 +414,10 @@ def _check(image: Any) -> None:
         raise TypeError(f'image must be uint8, uint16 or float32, got {image.dtype}{hint}')
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))):
         raise ValueError(f'image must be H×W (grey), H×W×3 (BGR) or H×W×4 (BGRA), got shape {image.shape}')
-    if not 0 < image.size <= 4 * MOST_PIXELS or image.shape[0] * image.shape[1] > MOST_PIXELS:
-        raise ValueError(f'image must have 1 to {MOST_PIXELS} pixels, got shape {image.shape}')
+    rows, columns = image.shape[:2]
+    if not image.size or rows * columns > MOST_PIXELS or (rows + BORDER) * (columns + BORDER) >= 2**31:
+        raise ValueError(
+            f'image must have 1 to {MOST_PIXELS} pixels, fewer if it is very thin, got shape {image.shape}')
 
 
 def _stages(kept: dict[str, Any], segments: NDArray[np.void]) -> Stages:

@@ -113,7 +113,8 @@ ARC = 0.273
 DIRECTIONS, IS_CLAIMED = 128, 128
 #: Claims count where the directions differ by at most so many steps, 25 degrees.
 SAME_DIRECTION = 9
-#: Lines are put into order by so many kinds of strengths; bits of a float that do not tell on them.
+#: Lines are put into order by so many kinds of strengths, which are 3 % apart, and bits of a float that do not tell on
+#: them.
 KEYS, KEY_SHIFT = 1 << 13, 18
 #: How many lines before their turn what is along them is asked for, and they themselves are.
 AHEAD, FAR_AHEAD = 2, 10
@@ -206,7 +207,7 @@ def refine_lines(
         team: Who does the work.
 
     Returns:
-        SEGMENT_DTYPE, strongest first guess first, a new array.
+        SEGMENT_DTYPE, strongest first guess first, to 3 %, a new array.
     """
     gradient, pad, height, width, noise, step, correlation = ridges
     flat, stride = gradient.reshape(-1), gradient.shape[1]
@@ -445,7 +446,7 @@ def align_to_peaks(line: Any, gradient: Any, axes: Axes, move: float) -> float:
         first, second = behind - before, behind + before - (at + at)
         second = second + second
         near = there & (abs(first) < second * -FARTHEST_PEAK)
-        t, d = where(near, floats(s) - half, ZERO), where(near, r - q - first / second, ZERO)
+        t, d = where(near, floats(s) - half, ZERO), where(near, r - q - first / where(near, second, ONE), ZERO)
         peaks = peaks + where(near, every(1), ZERO)
         sum_t = sum_t + t
         sum_tt = sum_tt + t * t
@@ -876,10 +877,10 @@ def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -
     """Count how many of the pixels that are looked at have a norm of each bin, or a larger one."""
     for k in range(counts.size):
         counts[k] = 0
-    every, turns = max(height // MOST_ROWS, COUNT_ROWS), max(width // MOST_COLUMNS, COUNT_COLUMNS)
-    for k in range((height + every - 1) // every):
+    apart, turns = max(height // MOST_ROWS, COUNT_ROWS), max(width // MOST_COLUMNS, COUNT_COLUMNS)
+    for k in range((height + apart - 1) // apart):
         # At another place each time: of a pattern that repeats all is to be seen.
-        row = every * k + int(every * (SCATTER * k % 1))
+        row = apart * k + int(apart * (SCATTER * k % 1))
         if row >= height:
             continue
         for column in range(k % turns, width, turns):

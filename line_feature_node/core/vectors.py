@@ -6,7 +6,7 @@ instead of 0.03 ms for 640×480). Rows must be turned into lanes and back, for w
 instead of 0.02 ms each way). And along a line pixels are anywhere in memory, and sums are taken one by one; several
 steps at once take half of the time. bench/vectors.py measures all.
 
-A vector is a few LLVM instructions that every processor has. Under NUMBA_DISABLE_JIT it is a NumPy array of as many
+A vector is a few instructions of LLVM, for any processor. Under NUMBA_DISABLE_JIT it is a NumPy array of as many
 numbers, and the functions are their plain twins, which stand beside them; tests hold the one against the other.
 """
 
@@ -54,7 +54,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 _ROWS = _Vector(types.float32, LANES)
-_FLOATS, _INTEGERS, _MASK = (_Vector(element, STEPS) for element in (types.float32, types.int32, types.boolean))
+_FLOATS, _INTEGERS = _Vector(types.float32, STEPS), _Vector(types.int32, STEPS)
 
 
 def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: Any) -> Any:
@@ -83,18 +83,18 @@ def _as_vectors(context: Any, builder: Any, vector: Any, kinds: Any, values: Any
 
 # Operators, of vectors of a kind, and of a vector and a number
 
-def _define(function: Any, generate: Callable[..., Any], result: Any = None) -> None:
+def _define(function: Any, generate: Callable[..., Any], *, compares: bool = False) -> None:
     """Teach Numba an operator.
 
     Args:
         function: What the operator stands for.
         generate: From a builder and the operands, vectors, the result.
-        result: Its type; that of the operands where it is not given.
+        compares: Whether the result is a mask; it is what the operands are otherwise.
     """
     def generic(self: Any, arguments: Any, keywords: Any) -> Any:
         vectors = [kind for kind in arguments if isinstance(kind, _Vector)]
         if vectors and all(kind == vectors[0] or isinstance(kind, types.Number) for kind in arguments):
-            return signature_of(result or vectors[0], *arguments)
+            return signature_of(_Vector(types.boolean, vectors[0].lanes) if compares else vectors[0], *arguments)
         return None
 
     infer_global(function)(type('Template', (AbstractTemplate,), {'key': function, 'generic': generic}))
@@ -141,9 +141,9 @@ _define(operator.add, _arithmetic('fadd', 'add'))
 _define(operator.sub, _arithmetic('fsub', 'sub'))
 _define(operator.mul, _arithmetic('fmul', 'mul'))
 _define(operator.truediv, lambda builder, first, second: builder.fdiv(first, second, flags=('contract',)))
-_define(operator.lt, _comparison('<'), _MASK)
-_define(operator.le, _comparison('<='), _MASK)
-_define(operator.ge, _comparison('>='), _MASK)
+_define(operator.lt, _comparison('<'), compares=True)
+_define(operator.le, _comparison('<='), compares=True)
+_define(operator.ge, _comparison('>='), compares=True)
 _define(operator.and_, lambda builder, first, second: builder.and_(first, second))
 _define(abs, _of_llvm('llvm.fabs'))
 
@@ -152,6 +152,8 @@ _define(abs, _of_llvm('llvm.fabs'))
 
 def load_plain(array: Any, index: int) -> Any:
     """LANES values of a flat float32 array from an index on, as a vector."""
+    if not 0 <= index <= array.size - LANES:
+        raise IndexError(f'{LANES} values from {index} on are not in an array of {array.size}')
     return array[index:index + LANES].copy()
 
 
@@ -230,7 +232,9 @@ def _fetch(typing: Any, array: Any, index: Any) -> Any:
             builder.module, ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT]), 'llvm.prefetch.p0')
         data = context.make_array(array)(context, builder, arguments[0]).data
         item = builder.bitcast(builder.gep(data, [arguments[1]]), byte)
-        for place in range(0, context.get_abi_sizeof(context.get_data_type(array.dtype)), CACHE_LINE):
+        size = context.get_abi_sizeof(context.get_data_type(array.dtype))
+        # A large item may begin anywhere in a line, and end in one more.
+        for place in [*range(0, size, CACHE_LINE), *([size - 1] if size > CACHE_LINE else [])]:
             # To read, into the first cache, as data.
             builder.call(function, [builder.gep(item, [ir.Constant(_INT, place)]),
                                     *(ir.Constant(_INT, option) for option in (0, 3, 1))])
