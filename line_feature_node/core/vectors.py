@@ -4,7 +4,7 @@ Numba's loops over arrays are vectorised by LLVM where one step does not depend 
 does, so many rows are taken at once, one a lane; written as a loop over lanes LLVM keeps the state in memory (0.14
 instead of 0.03 ms for 640×480). Rows must be turned into lanes and back, for which a loop moves single floats (0.10
 instead of 0.02 ms each way). And along a line pixels are anywhere in memory, and sums are taken one by one; several
-steps at once take half of the time. bench/vectors.py measures all.
+steps at once take less than two thirds of the time. bench/vectors.py measures all.
 
 A vector is a few instructions of LLVM, for any processor. Under NUMBA_DISABLE_JIT it is a NumPy array of as many
 numbers, and the functions are their plain twins, which stand beside them; tests hold the one against the other.
