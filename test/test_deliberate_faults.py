@@ -52,3 +52,12 @@ def test_a_text_that_is_not_there_once_is_refused(monkeypatch, capsys, text, tim
     monkeypatch.setitem(faults.FAULTS, 'indices', [(text, '')])
     assert run(monkeypatch, '--module', 'indices') == 2
     assert capsys.readouterr().err == f'indices.py has {times} times, not once: {text}\n'
+
+
+def test_the_table_in_the_documents_is_of_these_faults():
+    text = (ROOT / 'docs' / 'reliability.md').read_text(encoding='utf-8')
+    section = text.split('## Deliberate faults')[1].split('\n## ')[0]
+    rows = [row.rpartition(' | ')[0] for row in section.splitlines() if row.startswith('| ') and '`' in row]
+    assert rows == [f'| {module} | {faults.shown(old)} | {faults.shown(new)}'
+                    for module, pairs in faults.FAULTS.items() for old, new in pairs]
+    assert f'All {len(rows)} are found' in section

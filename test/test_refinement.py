@@ -91,6 +91,104 @@ def turn_of(segment: Any, degrees: float) -> float:
     return float((segment['theta'] - math.radians(degrees) + math.pi / 2) % math.pi - math.pi / 2)
 
 
+# Where a line is in the picture
+
+NOT_FINITE = [math.nan, math.inf, -math.inf, 1e300]
+
+
+@pytest.mark.parametrize(('slope', 'intercept', 'first', 'last', 'expected'), [
+    (0.0, 10.0, 2.5, 7.5, (3, 7)), (0.0, 10.0, -50.0, 1e9, (0, 99)), (0.0, 49.5, 0.0, 9.0, (0, 9)),
+    (1.0, -20.0, 0.0, 99.0, (20, 69)), (-1.0, 20.0, 0.0, 99.0, (0, 20)), (0.1, 4.0, 10.0, 12.0, (10, 12))])
+def test_where_a_line_is_within_the_picture(
+    slope: float, intercept: float, first: float, last: float, expected: tuple[int, int],
+) -> None:
+    assert within(slope, intercept, first, last, 0.5, 100, 50) == expected
+
+
+@pytest.mark.parametrize(('slope', 'intercept', 'first', 'last'), [
+    (0.0, 60.0, 0.0, 9.0), (0.0, 10.0, 7.0, 6.0), (1e-300, 1e6, 0.0, 99.0), (1.0, 100.0, 0.0, 99.0),
+    (0.0, 10.0, 120.0, 130.0), (0.0, 10.0, -9.0, -1.0),
+    *((value, 0.0, 0.0, 5.0) for value in NOT_FINITE), *((0.0, value, 0.0, 5.0) for value in NOT_FINITE),
+    *((0.0, 0.0, value, 5.0) for value in NOT_FINITE), *((0.0, 0.0, 0.0, value) for value in NOT_FINITE)])
+def test_a_line_that_is_nowhere_in_the_picture(slope: float, intercept: float, first: float, last: float) -> None:
+    """No place is looked at, as it would lie outside the memory of the picture."""
+    low, high = within(slope, intercept, first, last, 0.5, 100, 50)
+    assert high < low
+    assert low >= 0
+    assert high >= -1
+
+
+def test_norms_are_counted_from_the_top() -> None:
+    gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
+    counts = np.ones(NORM_BINS, np.int64)
+    count_norms(gradient, 2, 36, 46, counts)
+    rows = [0, 12, 17, 30, 35]  # one in COUNT_ROWS, at another place among them each time
+    norms = np.concatenate([np.hypot(*gradient[row + 2, 2 + k % COUNT_COLUMNS:48:COUNT_COLUMNS].T)
+                            for k, row in enumerate(rows) if row < 36])
+    assert counts[0] == norms.size
+    assert counts.tolist() == [np.count_nonzero(norms >= NORM_BIN * k) for k in range(NORM_BINS)]
+
+
+def test_rarity_of_a_norm_is_the_share_of_those_as_large() -> None:
+    gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
+    counts, rarities = np.ones(NORM_BINS, np.int64), np.ones(NORM_BINS)
+    rank_norms(gradient, 2, 36, 46, counts, rarities)
+    assert len(set(counts.tolist())) > 50
+    np.testing.assert_allclose(rarities, -np.log10(np.maximum(counts / counts[0], RAREST)), rtol=1e-12)
+
+
+def test_strongest_come_first() -> None:
+    """By the first bits, and equal ones in the order of the list; also what is no number has its place."""
+    strengths = np.random.default_rng(0).lognormal(3, 2, 500).astype(np.float32)
+    strengths[[3, 40, 400, 401, 402]] = np.inf, 0, 0, np.nan, 1e-40
+    strengths[100:110] = strengths[100]
+    order, bits = np.full(500, -1, np.int64), strengths.view(np.uint32)
+    strongest_first(bits, np.ones(KEYS, np.int64), order)
+    np.testing.assert_array_equal(order, np.argsort(-(bits.astype(np.int64) >> KEY_SHIFT), kind='stable'))
+    ordered = strengths[order]
+    assert np.isnan(ordered[0])
+    assert (ordered[2:-4] >= 0.969 * ordered[3:-3]).all()
+
+
+# Claims
+
+def ridge(first: float, last: float, sign: float = 1.0, steep: bool = False, intercept: float = 30.0) -> Any:
+    """A line along an axis of a picture."""
+    lines = np.zeros(1, RIDGE_DTYPE)
+    lines['steep'], lines['intercept'], lines['sign'] = steep, intercept, sign
+    lines['first'], lines['last'] = first, last
+    lines['begin'], lines['end'] = first, last
+    return lines[0]
+
+
+@pytest.mark.parametrize('steep', [False, True])
+@pytest.mark.parametrize(('ends', 'kept', 'share'), [
+    ((20, 120), (50, 120), 0), ((0, 40), (0, 10), 0), ((60, 120), (60, 120), 0), ((51, 90), (51, 90), 0.05),
+    ((0, 100), (0, 100), 0.41), ((20, 40), None, 1), ((8, 40), (8, 10), 0)])
+def test_a_line_leaves_its_ends_to_those_who_claim_them(
+    ends: tuple[float, float], kept: tuple[float, float] | None, share: float, steep: bool,
+) -> None:
+    """Not what is claimed in its middle, nor a few pixels where it meets another."""
+    claims = np.zeros(2 * 100 * 100, np.uint8)
+    claim(ridge(10, 50, steep=steep), claims, 200, 200)
+    line = ridge(*ends, steep=steep)
+    assert leave(line, claims, 200, 200) == pytest.approx(share, abs=0.03)
+    if kept is not None:
+        assert (line['begin'], line['end']) == pytest.approx(kept, abs=2.5)
+    other = ridge(*ends, -1.0, steep)
+    assert leave(other, claims, 200, 200) == 0
+    assert (other['begin'], other['end']) == ends
+
+
+def test_claims_of_both_sides_of_a_thin_line_stand_beside_each_other() -> None:
+    """Whichever comes first: the second one is claimed for those who come then, too."""
+    claims = np.zeros(2 * 50 * 50, np.uint8)
+    for sign in (1.0, -1.0):
+        assert claimed(ridge(10, 90, sign), claims, 100, 100) == 0
+        claim(ridge(10, 90, sign), claims, 100, 100)
+        assert claimed(ridge(10, 90, sign), claims, 100, 100) == 1
+
+
 # Straight edges
 
 @cache
@@ -629,64 +727,7 @@ def test_gradients_that_are_no_numbers_end_no_process() -> None:
     assert all(np.isfinite(end_points(segments)).ravel())
 
 
-# Where a line is in the picture
-
-NOT_FINITE = [math.nan, math.inf, -math.inf, 1e300]
-
-
-@pytest.mark.parametrize(('slope', 'intercept', 'first', 'last', 'expected'), [
-    (0.0, 10.0, 2.5, 7.5, (3, 7)), (0.0, 10.0, -50.0, 1e9, (0, 99)), (0.0, 49.5, 0.0, 9.0, (0, 9)),
-    (1.0, -20.0, 0.0, 99.0, (20, 69)), (-1.0, 20.0, 0.0, 99.0, (0, 20)), (0.1, 4.0, 10.0, 12.0, (10, 12))])
-def test_where_a_line_is_within_the_picture(
-    slope: float, intercept: float, first: float, last: float, expected: tuple[int, int],
-) -> None:
-    assert within(slope, intercept, first, last, 0.5, 100, 50) == expected
-
-
-@pytest.mark.parametrize(('slope', 'intercept', 'first', 'last'), [
-    (0.0, 60.0, 0.0, 9.0), (0.0, 10.0, 7.0, 6.0), (1e-300, 1e6, 0.0, 99.0), (1.0, 100.0, 0.0, 99.0),
-    (0.0, 10.0, 120.0, 130.0), (0.0, 10.0, -9.0, -1.0),
-    *((value, 0.0, 0.0, 5.0) for value in NOT_FINITE), *((0.0, value, 0.0, 5.0) for value in NOT_FINITE),
-    *((0.0, 0.0, value, 5.0) for value in NOT_FINITE), *((0.0, 0.0, 0.0, value) for value in NOT_FINITE)])
-def test_a_line_that_is_nowhere_in_the_picture(slope: float, intercept: float, first: float, last: float) -> None:
-    """No place is looked at, as it would lie outside the memory of the picture."""
-    low, high = within(slope, intercept, first, last, 0.5, 100, 50)
-    assert high < low
-    assert low >= 0
-    assert high >= -1
-
-
-def test_norms_are_counted_from_the_top() -> None:
-    gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
-    counts = np.ones(NORM_BINS, np.int64)
-    count_norms(gradient, 2, 36, 46, counts)
-    rows = [0, 12, 17, 30, 35]  # one in COUNT_ROWS, at another place among them each time
-    norms = np.concatenate([np.hypot(*gradient[row + 2, 2 + k % COUNT_COLUMNS:48:COUNT_COLUMNS].T)
-                            for k, row in enumerate(rows) if row < 36])
-    assert counts[0] == norms.size
-    assert counts.tolist() == [np.count_nonzero(norms >= NORM_BIN * k) for k in range(NORM_BINS)]
-
-
-def test_rarity_of_a_norm_is_the_share_of_those_as_large() -> None:
-    gradient = np.random.default_rng(0).normal(0, 300, (40, 50, 2)).astype(np.float32)
-    counts, rarities = np.ones(NORM_BINS, np.int64), np.ones(NORM_BINS)
-    rank_norms(gradient, 2, 36, 46, counts, rarities)
-    assert len(set(counts.tolist())) > 50
-    np.testing.assert_allclose(rarities, -np.log10(np.maximum(counts / counts[0], RAREST)), rtol=1e-12)
-
-
-def test_strongest_come_first() -> None:
-    """By the first bits, and equal ones in the order of the list; also what is no number has its place."""
-    strengths = np.random.default_rng(0).lognormal(3, 2, 500).astype(np.float32)
-    strengths[[3, 40, 400, 401, 402]] = np.inf, 0, 0, np.nan, 1e-40
-    strengths[100:110] = strengths[100]
-    order, bits = np.full(500, -1, np.int64), strengths.view(np.uint32)
-    strongest_first(bits, np.ones(KEYS, np.int64), order)
-    np.testing.assert_array_equal(order, np.argsort(-(bits.astype(np.int64) >> KEY_SHIFT), kind='stable'))
-    ordered = strengths[order]
-    assert np.isnan(ordered[0])
-    assert (ordered[2:-4] >= 0.969 * ordered[3:-3]).all()
-
+# Edges side by side
 
 @pytest.mark.parametrize('period', [3, 4, 5, 8])
 @pytest.mark.parametrize('size', [160, 600, 1200])
@@ -725,40 +766,3 @@ def test_a_line_that_is_cut_is_told_of_by_the_rest() -> None:
     assert weak['contrast'][0] == pytest.approx(12, abs=6)
     assert weak['size'][0] <= weak['length'][0] + 2
     assert found['contrast'].max() == pytest.approx(100, rel=0.1)
-
-
-def ridge(first: float, last: float, sign: float = 1.0, steep: bool = False, intercept: float = 30.0) -> Any:
-    """A line along an axis of a picture."""
-    lines = np.zeros(1, RIDGE_DTYPE)
-    lines['steep'], lines['intercept'], lines['sign'] = steep, intercept, sign
-    lines['first'], lines['last'] = first, last
-    lines['begin'], lines['end'] = first, last
-    return lines[0]
-
-
-@pytest.mark.parametrize('steep', [False, True])
-@pytest.mark.parametrize(('ends', 'kept', 'share'), [
-    ((20, 120), (50, 120), 0), ((0, 40), (0, 10), 0), ((60, 120), (60, 120), 0), ((51, 90), (51, 90), 0.05),
-    ((0, 100), (0, 100), 0.41), ((20, 40), None, 1), ((8, 40), (8, 10), 0)])
-def test_a_line_leaves_its_ends_to_those_who_claim_them(
-    ends: tuple[float, float], kept: tuple[float, float] | None, share: float, steep: bool,
-) -> None:
-    """Not what is claimed in its middle, nor a few pixels where it meets another."""
-    claims = np.zeros(2 * 100 * 100, np.uint8)
-    claim(ridge(10, 50, steep=steep), claims, 200, 200)
-    line = ridge(*ends, steep=steep)
-    assert leave(line, claims, 200, 200) == pytest.approx(share, abs=0.03)
-    if kept is not None:
-        assert (line['begin'], line['end']) == pytest.approx(kept, abs=2.5)
-    other = ridge(*ends, -1.0, steep)
-    assert leave(other, claims, 200, 200) == 0
-    assert (other['begin'], other['end']) == ends
-
-
-def test_claims_of_both_sides_of_a_thin_line_stand_beside_each_other() -> None:
-    """Whichever comes first: the second one is claimed for those who come then, too."""
-    claims = np.zeros(2 * 50 * 50, np.uint8)
-    for sign in (1.0, -1.0):
-        assert claimed(ridge(10, 90, sign), claims, 100, 100) == 0
-        claim(ridge(10, 90, sign), claims, 100, 100)
-        assert claimed(ridge(10, 90, sign), claims, 100, 100) == 1
