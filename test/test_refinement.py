@@ -191,6 +191,15 @@ def test_claims_of_both_sides_of_a_thin_line_stand_beside_each_other() -> None:
 
 # Straight edges
 
+@pytest.mark.parametrize('degrees', [0, 10, 45, 80, 90, 100, 135, 170])
+def test_code_is_that_of_the_pixels(degrees: float) -> None:
+    """The direction of the gradient, as edge extraction has it."""
+    stages = LineFeatureExtractor().stages(picture(60 + 100 * half_plane(40, 40, degrees, 20.3, 19.8)))
+    codes = stages.candidates[8:-8, 8:-8]
+    assert len(stages.segments) == 1
+    assert stages.segments['code'][0] == np.bincount(codes[codes > 0]).argmax()
+
+
 @cache
 def errors_of_edges(sigma: float, count: int = 250, size: int = 120) -> npt.NDArray[np.float64]:
     """What is wrong with the segments of edges in any position.
