@@ -99,8 +99,8 @@ def arithmetic(a: Any, b: Any, number: float, results: Any) -> None:
 def plain_arithmetic(a: Floats, b: Floats, number: float) -> Floats:
     x, y = a[0:16:2], b[0:16:2]
     results = [x + y, x - y, x * y, x / y, abs(x), number - x, x * number, np.floor(x),
-               vectors.floats_plain(vectors.integers_plain(x)), vectors.smaller_plain(x, y), vectors.larger_plain(x, y),
-               vectors.larger_plain(x, number), vectors.where_plain(x < y, x, number),
+               vectors.floats_plain(vectors.integers_plain(x)), np.where(x < y, x, y), np.where(x >= y, x, y),
+               np.where(x >= number, x, number), vectors.where_plain(x < y, x, number),
                vectors.where_plain((x <= y) & (y >= number), vectors.every_plain(1), 0),
                vectors.every_plain(vectors.total_plain(x)), vectors.total_plain(y)]
     return np.hstack(results).astype(np.float32)
@@ -143,7 +143,7 @@ def test_whole_numbers() -> None:
     s = vectors.ramp_plain(1)
     np.testing.assert_array_equal(s, [1, 2, 3, 4, 5, 6, 7, 8])
     np.testing.assert_array_equal(results, np.hstack([
-        s, s * 5 - 2, vectors.larger_plain(vectors.smaller_plain(s, 5), 3),
+        s, s * 5 - 2, np.clip(s, 3, 5),
         vectors.where_plain((s < 5) & (s >= 3), vectors.every_plain(1), 0)]))
 
 

@@ -23,6 +23,8 @@ from numba.core.typing import signature as signature_of
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, models, register_model
 
+from line_feature_node.core.compiling import inlined
+
 #: Lanes of a vector of rows: two registers of AVX-512, four of AVX2, eight of NEON or SSE, which hides latencies.
 LANES = 32
 #: Lanes of a vector of steps along a line.
@@ -311,34 +313,6 @@ def _where(typing: Any, mask: Any, vector: Any, other: Any) -> Any:
     return vector(mask, vector, other), generate
 
 
-def smaller_plain(vector: Any, other: Any) -> Any:
-    """The smaller one, lane by lane; the other may be a number, and stands in for what is none."""
-    return where_plain(vector < other, vector, other)
-
-
-def larger_plain(vector: Any, other: Any) -> Any:
-    """The larger one, lane by lane; the other may be a number, and stands in for what is none."""
-    return where_plain(other < vector, vector, other)
-
-
-@intrinsic
-def _smaller(typing: Any, vector: Any, other: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        first, second = _as_vectors(context, builder, vector, signature.args, arguments)
-        return builder.select(_comparison('<')(builder, first, second), first, second)
-
-    return vector(vector, other), generate
-
-
-@intrinsic
-def _larger(typing: Any, vector: Any, other: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        first, second = _as_vectors(context, builder, vector, signature.args, arguments)
-        return builder.select(_comparison('<')(builder, second, first), first, second)
-
-    return vector(vector, other), generate
-
-
 def total_plain(vector: Any) -> Any:
     """The sum of all lanes, in the same order on every processor: the halves are added, then those of the sum, ..."""
     while vector.size > 1:
@@ -418,7 +392,17 @@ floats: Any = floats_plain if _PLAIN else _floats
 integers: Any = integers_plain if _PLAIN else _integers
 floor: Any = np.floor if _PLAIN else _floor
 where: Any = where_plain if _PLAIN else _where
-smaller: Any = smaller_plain if _PLAIN else _smaller
-larger: Any = larger_plain if _PLAIN else _larger
 total: Any = total_plain if _PLAIN else _total
 transpose: Any = transpose_plain if _PLAIN else _transpose
+
+
+@inlined
+def smaller(vector: Any, other: Any) -> Any:
+    """The smaller one, lane by lane; the other may be a number, and stands in for what is none."""
+    return where(vector < other, vector, other)
+
+
+@inlined
+def larger(vector: Any, other: Any) -> Any:
+    """The larger one, lane by lane; the other may be a number, and stands in for what is none."""
+    return where(vector >= other, vector, other)
