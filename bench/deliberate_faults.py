@@ -24,10 +24,13 @@ PARTS = ('bags', 'config', 'docs', 'line_feature_node', 'test', 'pyproject.toml'
 #: Text of each module that stands there once, and what is wrong in its place.
 FAULTS = {
     'blobs': [
-        ('(pixel + one, below - one, below, below + one)', '(pixel + one, below, below + one)'),
-        ("max(blob['max_row'], row)", "max(blob['max_row'], column)"),
-        ('range(blobs.size, 0, -1)', 'range(blobs.size - 1, 0, -1)'),
-        ('sxy + x * y, syy + y * y', 'sxy + x * x, syy + y * y'),
+        ('(pixel + 1, pixel + stride - 1, pixel + stride, ', '(pixel + 1, pixel + stride, '),
+        ('is_alike(marks, below + one, own))', '0)'),
+        ('labels[run] = labels[labels[run]]', 'labels[run] = labels[run]'),
+        ("max(blob['max_row'], part['max_row'])", "max(blob['max_row'], part['max_col'])"),
+        ('top, bottom = min(top, rows[k]), max(bottom, rows[k])', 'top, bottom = min(top, rows[k]), rows[k]'),
+        ('sxy + there * x * y', 'sxy + there * x * x'),
+        ('np.int64(1) - bridged[k]', 'np.int64(1)'),
     ],
     'buffers': [
         ('size + size // 4', 'size - size // 4'),
@@ -136,6 +139,9 @@ FAULTS = {
         ('np.int64(mark & OPEN) >> 7 - direction', 'np.int64(mark & OPEN) >> 6 - direction'),
         ('(2 * span_y * k + steps)', '(2 * span_y * k)'),
         ('and between != 2', 'and between != 3'),
+        ('fan_offsets[max_gap + 1]', 'fan_offsets[max_gap]'),
+        ('row - inner_row + REACH, column - inner_column + REACH',
+         'column - inner_column + REACH, row - inner_row + REACH'),
         ('0 <= pixel % stride + step < stride', '0 <= pixel % stride + step'),
         ('length - first >= 4', 'length - first >= 3'),
         ('for gap in range(max_gap + 1):', 'for gap in range(max_gap):'),
@@ -153,13 +159,13 @@ FAULTS = {
         ('first + min(end * UNIT, size)', 'first + end * UNIT'),
         ('end - unit < LONGEST', 'end - unit <= LONGEST'),
         ('stop - start < min_size', 'stop - start <= min_size'),
-        ('np.int64(1) - bridged[k]', 'np.int64(1)'),
-        ('UNIT * unit, UNIT, sums', 'UNIT * unit, UNIT - 1, sums'),
+        ('UNIT * unit, UNIT * unit + UNIT', 'UNIT * unit, UNIT * unit + UNIT - 1'),
         ('+ (NOISE_DEVIATION', '- (NOISE_DEVIATION'),
     ],
     'team': [
         ('[results[number] for number in range(len(results))]', 'list(results.values())'),
         ('tools[thread:thread + 1]', 'tools[0:1]'),
+        ('tools[:1]', 'tools[1:2]'),
         ('if not all(helper.done() for helper in helpers):', 'if False:'),
         ('if first < end]', 'if first <= end]'),
         ('not all(thread.is_alive() for thread in self._threads)', 'False'),

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, colour, extract_blobs
+from line_feature_node.core.blobs import BLOB_DTYPE, Blobs, extract_blobs, join, paint
 from line_feature_node.core.buffers import Buffers
+from line_feature_node.core.edges import CODE, OPEN
+from line_feature_node.core.scanning import BRIDGED, TAKEN
 
 Pixels = NDArray[np.int64]
 #: dir, min_row, max_row, min_col, max_col and the pixels as (row, column).
@@ -61,15 +63,21 @@ def extract(
     flat = (pixels[:, 0] + margin) * shape[1] + pixels[:, 1] + margin
     codes = image[pixels[:, 0], pixels[:, 1]]
     bridged = np.zeros(len(flat), np.bool_) if filled is None else filled
-    return extract_blobs(flat.astype(np.int32), codes, bridged, shape, margin, buffers or Buffers()), pixels
+    # What is no edge may have a code, as candidates that scanning did not reach have.
+    marks = np.random.default_rng(image.size).choice(np.array([0, 3, OPEN | 1], np.uint8), shape)
+    marks.reshape(-1)[flat] = np.where(bridged, TAKEN | BRIDGED, TAKEN)
+    blobs = extract_blobs(flat.astype(np.int32), codes, bridged, marks, margin, buffers or Buffers())
+    np.testing.assert_array_equal(marks.reshape(-1)[flat] & CODE, codes)
+    return blobs, pixels
 
 
 def listed(blobs: Blobs, pixels: Pixels) -> list[Blob]:
     """The blobs in use, comparable."""
     found = []
+    all_members, offsets = blobs.members()
     for k, blob in enumerate(blobs.attributes):
         if blob['select']:
-            members = pixels[blobs.members[blobs.offsets[k]:blobs.offsets[k + 1]]].tolist()
+            members = pixels[all_members[offsets[k]:offsets[k + 1]]].tolist()
             assert blob['size'] == len(members)
             found.append((*(int(blob[name]) for name in ('dir', 'min_row', 'max_row', 'min_col', 'max_col')),
                           tuple(sorted((row, column) for row, column in members))))
@@ -152,11 +160,12 @@ def test_members_are_a_partition(order: Callable[[NDArray[np.uint8]], Pixels]) -
     rng = np.random.default_rng(3)
     image = rng.choice(np.array([0, 1, 1, 1, 2], np.uint8), (50, 50))
     blobs, pixels = extract(image, order)
-    assert sorted(blobs.members.tolist()) == list(range(len(pixels)))
-    assert blobs.offsets.size == blobs.attributes.size + 1
-    assert blobs.offsets[0] == 0
-    assert blobs.offsets[-1] == len(pixels)
-    np.testing.assert_array_equal(np.diff(blobs.offsets), blobs.attributes['size'])
+    members, offsets = blobs.members()
+    assert sorted(members.tolist()) == list(range(len(pixels)))
+    assert offsets.size == blobs.attributes.size + 1
+    assert offsets[0] == 0
+    assert offsets[-1] == len(pixels)
+    np.testing.assert_array_equal(np.diff(offsets), blobs.attributes['size'])
 
 
 @pytest.mark.parametrize('order', ORDERS)
@@ -167,8 +176,9 @@ def test_moments(order: Callable[[NDArray[np.uint8]], Pixels], margin: int) -> N
     image = rng.choice(np.array([0, 1, 1, 1, 2], np.uint8), (40, 60))
     filled = rng.random(int((image > 0).sum())) < 0.2
     blobs, pixels = extract(image, order, margin, filled=filled)
-    for label, (first, last) in enumerate(pairwise(blobs.offsets)):
-        members = blobs.members[first:last]
+    all_members, offsets = blobs.members()
+    for label, (first, last) in enumerate(pairwise(offsets)):
+        members = all_members[first:last]
         y, x = pixels[members[~filled[members]]].T
         assert blobs.moments[label].tolist() == [len(x), x.sum(), y.sum(), (x * x).sum(), (x * y).sum(), (y * y).sum()]
 
@@ -182,19 +192,23 @@ def test_labels_that_merged_are_empty() -> None:
 
 
 def test_more_labels_than_a_byte_can_count_without_the_compiler() -> None:
-    """Codes are bytes, and Python computes in them where they are not turned into larger numbers."""
-    pixels = 10 + 2 * np.arange(90, dtype=np.int32)
-    codes = np.full(90, 4, np.uint8)
-    colours, labels, parents = (np.zeros(400, np.int32) for _ in range(3))
-    plain = getattr(colour, 'py_func', colour)
-    assert plain(pixels, codes, 200, colours, labels, parents) == 90
-    assert labels[:90].tolist() == parents[:90].tolist() == list(range(90))
+    """Codes and marks are bytes, and Python computes in them where they are not turned into larger numbers."""
+    stride, width = 680, 2 * 300
+    pixels = (stride + 1 + np.arange(0, width, 2)).astype(np.int32)
+    marks = np.zeros(3 * stride, np.uint8)
+    marks[pixels] = TAKEN
+    starts, follows, labels = np.zeros(301, np.int32), np.zeros(301, np.bool_), np.zeros(300, np.int32)
+    plain_paint, plain_join = (getattr(kernel, 'py_func', kernel) for kernel in (paint, join))
+    assert plain_paint(pixels, np.full(300, 4, np.uint8), stride, marks, starts, follows) == 300
+    plain_join(pixels, stride, marks, starts, follows, np.zeros(marks.size, np.int32), np.zeros(300, np.int32), labels)
+    assert labels.tolist() == list(range(300))
 
 
 def test_no_pixels() -> None:
     blobs, _ = extract(np.zeros((5, 5), np.uint8))
-    assert blobs.attributes.size == blobs.members.size == 0
-    assert blobs.offsets.tolist() == [0]
+    members, offsets = blobs.members()
+    assert blobs.attributes.size == members.size == 0
+    assert offsets.tolist() == [0]
 
 
 def test_frame_after_frame() -> None:
@@ -204,7 +218,6 @@ def test_frame_after_frame() -> None:
     for shape in [(30, 40), (30, 40), (60, 50), (7, 9), (40, 30), (1, 1), (60, 50)]:
         image = rng.integers(0, 5, shape).astype(np.uint8)
         assert listed(*extract(image, shuffled, buffers=buffers)) == reference(image)
-        assert not buffers.array('colours', 1, np.int32, zeros=True).any()
 
 
 def test_moments_of_large_pictures_are_exact() -> None:
@@ -212,6 +225,6 @@ def test_moments_of_large_pictures_are_exact() -> None:
     stride = 1936
     pixels = (1071 * stride + np.arange(1, 1901)).astype(np.int32)
     codes, bridged = np.full(1900, 3, np.uint8), np.zeros(1900, np.bool_)
-    blobs = extract_blobs(pixels, codes, bridged, (1082, stride), 1, Buffers())
+    blobs = extract_blobs(pixels, codes, bridged, np.full((1082, stride), TAKEN, np.uint8), 1, Buffers())
     x, y = np.arange(1900, dtype=object), np.full(1900, 1070, dtype=object)
     assert blobs.moments.tolist() == [[1900, x.sum(), y.sum(), (x * x).sum(), (x * y).sum(), (y * y).sum()]]

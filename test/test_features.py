@@ -19,13 +19,14 @@ Pixel = tuple[int, int]
 LARGE = (4000, 4000)
 
 
-def moments_of(
-    pixels: NDArray[np.integer], offsets: NDArray[np.integer], filled: NDArray[np.bool_],
-) -> NDArray[np.float64]:
-    """Sums of 1, x, y, x^2, x y and y^2 over the pixels (x, y) of each blob, but for those that fill a gap."""
+def blobs_of(
+    attributes: NDArray[np.void], pixels: NDArray[np.integer], offsets: NDArray[np.integer], filled: NDArray[np.bool_],
+) -> Blobs:
+    """Blobs of pixels (x, y), with the sums of 1, x, y, x^2, x y and y^2 over those that do not fill a gap."""
     x, y = pixels.T.astype(float)
     parts = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], -1) * ~filled[:, None]
-    return np.array([parts[first:last].sum(0) for first, last in pairwise(offsets)]).reshape(-1, 6)
+    moments = np.array([parts[first:last].sum(0) for first, last in pairwise(offsets)]).reshape(-1, 6)
+    return Blobs(attributes, moments, offsets[:-1], offsets[1:], np.arange(len(attributes), dtype=np.int32))
 
 
 def segments(
@@ -40,9 +41,8 @@ def segments(
         attributes[k] = (codes[k] if codes else 1, len(blob), min(y), max(y), min(x), max(x), True)
     offsets = np.cumsum([0] + [len(blob) for blob in blobs]).astype(np.int32)
     filled = np.array([tuple(pixel) in bridged for pixel in pixels.tolist()], np.bool_)
-    lines, count = compute_lines(
-        Blobs(attributes, np.arange(len(pixels), dtype=np.int32), offsets, moments_of(pixels, offsets, filled)),
-        shape, Parameters(**{'min_size': 2, **parameters}), Buffers())
+    lines, count = compute_lines(blobs_of(attributes, pixels, offsets, filled), shape,
+                                 Parameters(**{'min_size': 2, **parameters}), Buffers())
     assert lines.size >= 2 * count
     return segments_of(lines, np.ones(count, np.bool_))
 
@@ -326,9 +326,8 @@ def test_labels_not_in_use_give_nothing() -> None:
     attributes = np.zeros(2, BLOB_DTYPE)
     attributes[1] = (3, 6, 4, 4, 10, 15, True)
     pixels, offsets = np.array([(x, 4) for x in range(10, 16)]), np.array([0, 0, 6], np.int32)
-    lines, count = compute_lines(
-        Blobs(attributes, np.arange(6, dtype=np.int32), offsets, moments_of(pixels, offsets, np.zeros(6, np.bool_))),
-        (20, 38), Parameters(), Buffers())
+    lines, count = compute_lines(blobs_of(attributes, pixels, offsets, np.zeros(6, np.bool_)), (20, 38), Parameters(),
+                                 Buffers())
     assert count == 1
     assert ends(segments_of(lines, np.ones(1, np.bool_))[0]) == [10, 4, 15, 4]
 

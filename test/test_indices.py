@@ -1,8 +1,9 @@
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from line_feature_node.core.indices import are_neighbours, position
+from line_feature_node.core.indices import are_neighbours, place_pixels, position
 
 
 @settings(max_examples=300, deadline=None)
@@ -12,6 +13,17 @@ def test_position(stride: int, data: st.DataObject) -> None:
     row = data.draw(st.integers(0, 2**30 // stride - 1))
     for column in (0, stride - 1, data.draw(st.integers(0, stride - 1))):
         assert position(row * stride + column, 1 / stride, stride) == (row, column)
+
+
+@pytest.mark.parametrize(('stride', 'margin'), [(8, 1), (648, 2), (2**20, 3)])
+def test_pixels_in_their_places(stride: int, margin: int) -> None:
+    rng = np.random.default_rng(stride)
+    x, y = rng.integers(0, stride - 2 * margin, 99), rng.integers(0, 1000, 99)
+    pixels = ((y + margin) * stride + x + margin).astype(np.int32)
+    columns, rows = np.zeros(99, np.int32), np.zeros(99, np.int32)
+    place_pixels(pixels, stride, margin, columns, rows)
+    np.testing.assert_array_equal(columns, x)
+    np.testing.assert_array_equal(rows, y)
 
 
 @pytest.mark.parametrize('stride', [8, 16, 648])

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from test_features import moments_of
+from test_features import blobs_of
 
-from line_feature_node.core.blobs import BLOB_DTYPE, Blobs
+from line_feature_node.core.blobs import BLOB_DTYPE
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.features import LINE_DTYPE, compute_lines, segments_of
 from line_feature_node.core.linking import adjacent, collinear, link_lines, merge, nearest_ends, overlapped
@@ -45,10 +45,8 @@ def computed(
     attributes: NDArray[np.void], pixels: NDArray[np.int64], offsets: NDArray[np.int32], shape: tuple[int, int],
     **parameters: Any,
 ) -> tuple[NDArray[np.void], int]:
-    moments = moments_of(pixels, offsets, np.zeros(len(pixels), np.bool_))
-    return compute_lines(
-        Blobs(attributes, np.arange(len(pixels), dtype=np.int32), offsets, moments), shape,
-        Parameters(**{'min_size': 2, **parameters}), Buffers())
+    return compute_lines(blobs_of(attributes, pixels, offsets, np.zeros(len(pixels), np.bool_)), shape,
+                         Parameters(**{'min_size': 2, **parameters}), Buffers())
 
 
 def line(*ends: int) -> Any:

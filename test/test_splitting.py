@@ -48,12 +48,13 @@ def split(
     found = split_chains(
         Chains(((flat[:, 1] + MARGIN) * STRIDE + flat[:, 0] + MARGIN).astype(np.int32), all_codes, fills, offsets,
                np.zeros(len(chains), np.bool_)), variance, STRIDE, MARGIN, min_size, buffers or Buffers())
-    assert found.offsets[0] == 0
-    assert len(found.offsets) == len(found.attributes) + 1
-    assert found.offsets[-1] == len(found.members)
+    all_members, starts = found.members()
+    assert starts[0] == 0
+    assert len(starts) == len(found.attributes) + 1
+    assert starts[-1] == len(all_members)
     stretches = []
     for k, blob in enumerate(found.attributes):
-        members = found.members[found.offsets[k]:found.offsets[k + 1]]
+        members = all_members[starts[k]:starts[k + 1]]
         assert (np.diff(members) == 1).all()
         chain = int(np.searchsorted(offsets, members[0], 'right')) - 1
         assert members[-1] < offsets[chain + 1]

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from line_feature_node.core.compiling import inlined
+from line_feature_node.core.compiling import inlined, kernel
 
 
 @inlined
@@ -22,3 +22,12 @@ def position(pixel: int, inverse: float, stride: int) -> tuple[Any, Any]:
     """
     row = np.int32((pixel + 0.5) * inverse)
     return row, pixel - row * stride
+
+
+@kernel
+def place_pixels(pixels: Any, stride: int, margin: int, columns: Any, rows: Any) -> None:
+    """Columns and rows of pixels: by themselves, as the compiler makes vectors of that."""
+    inverse = 1 / stride
+    for k in range(pixels.size):
+        row, column = position(pixels[k], inverse, stride)
+        columns[k], rows[k] = column - margin, row - margin

@@ -227,18 +227,17 @@ def find_pairs(
                 entry = cells[i, j]
                 while entry != -1:
                     other = entry // 2
-                    # Of the up to four ways to meet a pair here, its nearest ends are the one that counts.
-                    if alive[other] and is_near(line, end, lines[other], entry % 2, tau2):
-                        gap, ends = nearest_ends(line, lines[other])
-                        if not (ends == 2 * end + entry % 2 and adjacent(line, lines[other], tau2)
-                                and collinear(line, lines[other], tau1) and not overlapped(line, lines[other])):
-                            entry = entries[entry]
-                            continue
+                    # Most that meet are not collinear. Of the up to four ways to meet a pair here, its nearest ends are
+                    # the one that counts.
+                    if (alive[other] and is_near(line, end, lines[other], entry % 2, tau2)
+                            and collinear(line, lines[other], tau1) and adjacent(line, lines[other], tau2)
+                            and not overlapped(line, lines[other])
+                            and nearest_ends(line, lines[other])[1] == 2 * end + entry % 2):
                         if found == pairs.shape[0]:
                             return -1, waiting
                         swapped = precedes(line, lines[other]) > 0
                         pairs[found, 0], pairs[found, 1] = (other, k) if swapped else (k, other)
-                        gaps[found] = gap
+                        gaps[found] = nearest_ends(line, lines[other])[0]
                         push(heap, waiting, found, lines, pairs, gaps)
                         found += 1
                         waiting += 1

@@ -307,7 +307,7 @@ def lines_of_edges(
     normalize_codes(chains, p.n if by_codes else 0)
     watch('normalization', chains.codes)
     if by_codes:
-        blobs = extract_blobs(chains.pixels, chains.codes, chains.bridged, marks.shape, MARGIN, buffers)
+        blobs = extract_blobs(chains.pixels, chains.codes, chains.bridged, marks, MARGIN, buffers)
     else:
         blobs = split_chains(chains, _deviation(noise, p), marks.shape[1], MARGIN, p.min_size, buffers)
     watch('blobs', [blobs])
@@ -425,6 +425,7 @@ def _stages(kept: dict[str, Any], segments: NDArray[np.void]) -> Stages:
     grey, marks = kept['input'], kept['edges']
     chains, visited = kept['scanning']
     blobs = joined_blobs(kept['blobs'])
+    members, blob_offsets = blobs.members()
     lines = np.concatenate([part[:count] for part, count in kept['features']])
     height, width = grey.shape
     inside = slice(MARGIN, MARGIN + height), slice(MARGIN, MARGIN + width)
@@ -435,7 +436,7 @@ def _stages(kept: dict[str, Any], segments: NDArray[np.void]) -> Stages:
         edges=np.where(visited[inside] & TAKEN, candidates, 0).astype(np.uint8), chain_pixels=pixels,
         chain_offsets=chains.offsets, chain_directions=chain_directions(chains, marks.shape[1]), closed=chains.closed,
         bridged=chains.bridged, codes_before=chains.codes, codes_after=kept['normalization'],
-        blobs=blobs.attributes, blob_pixels=pixels[blobs.members], blob_offsets=blobs.offsets,
+        blobs=blobs.attributes, blob_pixels=pixels[members], blob_offsets=blob_offsets,
         unlinked=segments_of(lines, np.ones(lines.size, np.bool_)), linked=kept['refinement'], segments=segments)
 
 

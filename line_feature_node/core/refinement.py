@@ -13,7 +13,7 @@ lines, y for steep ones. All along it is looked at in whole steps of p.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,8 @@ from line_feature_node.core.vectors import (
     where,
 )
 
+#: Where lines are in a list. By this name, as the type of an argument of a function within one is made at each call.
+Places: TypeAlias = NDArray[np.int64]
 #: A line while it grows.
 RIDGE_DTYPE = np.dtype([
     ('steep', np.bool_),                                # whether p is y
@@ -220,7 +222,7 @@ def refine_lines(
     least = parameters.min_snr * noise, tests - math.log10(parameters.false_alarms)
     guesses, cells_twice = grown, 2 * -(-height // CELL) * -(-width // CELL)
 
-    def grow_some(some: NDArray[np.int64], memory: Buffers) -> None:
+    def grow_some(some: Places, memory: Buffers) -> None:
         claims = memory.array('claims', cells_twice, np.uint8)[:cells_twice]
         values = memory.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
         grow(some, guesses, rarities, least, flat, stride, pad, height, width, noise, claims, values, grown)

@@ -15,6 +15,7 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -86,7 +87,14 @@ def _fan(longest: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.array(steps), np.cumsum([0, *counts])
 
 
+def _pointing() -> NDArray[np.uint8]:
+    """The direction that a step of up to REACH rows and columns is nearest to, at those rows and columns plus REACH."""
+    y, x = np.mgrid[-REACH:REACH + 1, -REACH:REACH + 1]
+    return np.asarray(np.round(np.arctan2(y, x) / (np.pi / 4)) % 8, np.uint8)
+
+
 NEXT_STATE = _next_state()
+POINTING = _pointing()
 #: The place of the lowest bit of a mask.
 LOWEST = np.array([0, *((mask & -mask).bit_length() - 1 for mask in range(1, 256))], np.int64)
 
@@ -143,7 +151,8 @@ def scan_edges(marks: NDArray[np.uint8], parameters: Parameters, buffers: Buffer
     count, most = raw.closed.size, raw.pixels.size + parameters.max_gap * raw.closed.size
     links = buffers.array('links', 2 * count, np.int32)
     link_gaps(flat, stride, count, parameters.max_gap, FAN, FAN_OFFSETS, raw.pixels, raw.codes, raw.offsets,
-              buffers.array('ends', flat.size, np.int32), buffers.array('end directions', 2 * count, np.uint8), links)
+              buffers.array('ends', flat.size, np.int32), buffers.array('end directions', 2 * count, np.uint8),
+              buffers.array('facing', 2 * count, np.int32), links)
     pixels, codes = buffers.array('pixels', most, np.int32), buffers.array('codes', most, np.uint8)
     bridged = buffers.array('bridged', most, np.bool_)
     offsets, closed = buffers.array('offsets', count + 1, np.int32), buffers.array('closed', count, np.bool_)
@@ -165,7 +174,7 @@ def trace_edges(marks: NDArray[np.uint8], parts: int, buffers: Buffers) -> Itera
         The chains that each go added: offsets are those of all chains, into the pixels of all.
     """
     flat, (height, stride) = marks.reshape(-1), marks.shape
-    most = int(np.count_nonzero(flat))
+    most = cv2.countNonZero(marks)
     pixels, codes = buffers.array('raw pixels', most, np.int32), buffers.array('raw codes', most, np.uint8)
     offsets, stack = buffers.array('raw offsets', most + 1, np.int32), buffers.array('stack', most + 1, np.int32)
     bridged = buffers.array('not bridged', most, np.bool_, zeros=True)
@@ -333,7 +342,7 @@ def reverse(pixels: Any, codes: Any, first: int, end: int) -> None:
 @kernel
 def link_gaps(
     marks: Any, stride: int, chains: int, max_gap: int, fan: Any, fan_offsets: Any, pixels: Any, codes: Any,
-    offsets: Any, ends: Any, directions: Any, links: Any,
+    offsets: Any, ends: Any, directions: Any, facing: Any, links: Any,
 ) -> None:
     """Link the ends of chains over gaps of up to max_gap pixels, the shortest gaps first.
 
@@ -342,21 +351,43 @@ def link_gaps(
     nothing lies between. A chain of one pixel points nowhere and is not linked.
     """
     inverse = 1 / stride
-    for end in range(2 * chains):
-        links[end] = -1
-        directions[end] = end_direction(pixels, offsets, end, stride, inverse)
-        if directions[end] != END:
-            pixel = pixels[end_index(offsets, end)]
-            ends[pixel] = end
-            marks[pixel] = TAKEN | ENDING
+    pointing = 0
+    for chain in range(chains):
+        for end in range(2 * chain, 2 * chain + 2):
+            links[end] = -1
+            if offsets[chain + 1] - offsets[chain] > 1:
+                facing[pointing] = end
+                pointing += 1
+                directions[end] = end_direction(pixels, offsets, end, stride, inverse)
+                pixel = pixels[end_index(offsets, end)]
+                ends[pixel] = end
+                marks[pixel] = TAKEN | ENDING
+    # Most of them face none at all.
+    found = 0
+    for place in range(pointing):
+        end = facing[found] = facing[place]
+        found += faces_ends(pixels[end_index(offsets, end)], fan[directions[end]], fan_offsets[max_gap + 1], marks,
+                            stride)
     for gap in range(max_gap + 1):
-        for end in range(2 * chains):
-            if links[end] == -1 and directions[end] != END:
+        for place in range(found):
+            end = facing[place]
+            if links[end] == -1:
                 other = facing_end(end, gap, marks, stride, fan, fan_offsets, pixels, codes, offsets, ends, directions,
                                    links)
                 if other != -1:
                     links[end] = other
                     links[other] = end
+
+
+@inlined
+def faces_ends(pixel: int, steps: Any, count: int, marks: Any, stride: int) -> bool:
+    """Whether there is an end of a chain at any of so many steps from a pixel."""
+    seen = 0
+    for k in range(count):
+        target = np.int64(pixel) + steps[k, 0] + steps[k, 1] * stride
+        # As an unsigned number what is before the marks is far behind them.
+        seen |= marks[target] if np.uint64(target) < np.uint64(marks.size) else 0
+    return seen & ENDING != 0
 
 
 @inlined
@@ -392,24 +423,14 @@ def end_index(offsets: Any, end: int) -> int:
 
 @inlined
 def end_direction(pixels: Any, offsets: Any, end: int, stride: int, inverse: float) -> int:
-    """The chain-code direction in which a chain leaves over one of its ends; END for a chain of one pixel."""
+    """The chain-code direction in which a chain of two pixels or more leaves over one of its ends."""
     chain = end // 2
     reach = min(REACH, offsets[chain + 1] - offsets[chain] - 1)
-    if reach == 0:
-        return END
     index = end_index(offsets, end)
     inner = pixels[index + reach if end % 2 == 0 else index - reach]
     row, column = position(pixels[index], inverse, stride)
     inner_row, inner_column = position(inner, inverse, stride)
-    x, y = column - inner_column, row - inner_row
-    # 2 : 5 stands for tan 22.5 degrees, which no pair of steps up to REACH can tell from it.
-    if 5 * abs(y) < 2 * abs(x):
-        return 0 if x > 0 else 4
-    if 5 * abs(x) < 2 * abs(y):
-        return 2 if y > 0 else 6
-    if y > 0:
-        return 1 if x > 0 else 3
-    return 7 if x > 0 else 5
+    return int(POINTING[row - inner_row + REACH, column - inner_column + REACH])
 
 
 @inlined

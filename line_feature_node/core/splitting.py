@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from line_feature_node.core.blobs import BLOB_DTYPE, MOMENTS, Blobs, put_down
+from line_feature_node.core.blobs import BLOB_DTYPE, MOMENTS, Blobs, describe, moments_of, put_down
 from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
-from line_feature_node.core.indices import position
+from line_feature_node.core.indices import place_pixels
 from line_feature_node.core.scanning import Chains
 
 #: Pixels of a unit; units that a stretch begins with, and the most that it has: longer lines are found in parts.
@@ -55,8 +55,8 @@ def split_chains(
     size = int(chains.offsets[-1] - chains.offsets[0])
     most = size // min_size + 1
     attributes = buffers.array('stretches', most, BLOB_DTYPE)
-    members = buffers.array('members', size, np.int32)
-    offsets = buffers.array('blob offsets', most + 1, np.int32)
+    starts, ends = buffers.array('stretch starts', most, np.int32), buffers.array('stretch ends', most, np.int32)
+    labels = buffers.array('labels', most, np.int32)
     moments = buffers.array('moments', MOMENTS * most, np.float64)[:MOMENTS * most].reshape(most, MOMENTS)
     units = size // UNIT + 2
     sums = buffers.array('sums', MOMENTS * units, np.float64)[:MOMENTS * units].reshape(units, MOMENTS)
@@ -65,30 +65,20 @@ def split_chains(
     first, last = chains.offsets[0], chains.offsets[-1]
     place_pixels(chains.pixels[first:last], stride, margin, columns, rows)
     count = split(chains.offsets, columns, rows, chains.codes[first:last], chains.bridged[first:last], 1 / variance,
-                  min_size, sums, attributes, members, offsets, moments)
-    return Blobs(attributes[:count], members[:offsets[count]], offsets[:count + 1], moments[:count])
-
-
-@kernel
-def place_pixels(pixels: Any, stride: int, margin: int, columns: Any, rows: Any) -> None:
-    """Columns and rows of pixels: by themselves, as the compiler makes vectors of that."""
-    inverse = 1 / stride
-    for k in range(pixels.size):
-        row, column = position(pixels[k], inverse, stride)
-        columns[k], rows[k] = column - margin, row - margin
+                  min_size, sums, attributes, moments, starts, ends, labels)
+    return Blobs(attributes[:count], moments[:count], starts[:count], ends[:count], labels[:count])
 
 
 @kernel
 def split(
     chain_offsets: Any, columns: Any, rows: Any, codes: Any, bridged: Any, weight: float, min_size: int, sums: Any,
-    blobs: Any, members: Any, offsets: Any, moments: Any,
+    blobs: Any, moments: Any, starts: Any, ends: Any, labels: Any,
 ) -> int:
     """Divide every chain, and write out its stretches; return their number.
 
     Columns, rows, codes and whether they fill a gap are those of the chains' pixels, from the first chain's on.
     """
-    count, total, start_of_all = 0, 0, chain_offsets[0]
-    offsets[0] = 0
+    count, start_of_all = 0, chain_offsets[0]
     for chain in range(chain_offsets.size - 1):
         first, size = chain_offsets[chain] - start_of_all, chain_offsets[chain + 1] - chain_offsets[chain]
         if size < max(min_size, UNIT * (FIRST - 1) + 1):
@@ -107,12 +97,9 @@ def split(
             unit = end
             if stop - start < min_size:
                 continue
-            describe(columns[start:stop], rows[start:stop], codes[start:stop], blobs[count])
-            for k in range(stop - start):
-                members[total + k] = start_of_all + start + k
-            total += stop - start
+            describe(columns[start:stop], rows[start:stop], most_frequent(codes[start:stop]), blobs[count])
+            starts[count], ends[count], labels[count] = start_of_all + start, start_of_all + stop, count
             count += 1
-            offsets[count] = total
     return count
 
 
@@ -123,20 +110,17 @@ def sum_up(columns: Any, rows: Any, bridged: Any, sums: Any) -> None:
     for k in range(MOMENTS):
         sums[0, k] = 0
     for unit in range(size // UNIT):
-        add_unit(columns, rows, bridged, UNIT * unit, UNIT, sums, unit)
+        first, end = UNIT * unit, UNIT * unit + UNIT
+        add_unit(columns[first:end], rows[first:end], bridged[first:end], sums, unit)
     if size % UNIT > 0:
-        add_unit(columns, rows, bridged, size // UNIT * UNIT, size % UNIT, sums, size // UNIT)
+        first = size // UNIT * UNIT
+        add_unit(columns[first:], rows[first:], bridged[first:], sums, size // UNIT)
 
 
 @inlined
-def add_unit(columns: Any, rows: Any, bridged: Any, first: int, size: int, sums: Any, unit: int) -> None:
+def add_unit(columns: Any, rows: Any, bridged: Any, sums: Any, unit: int) -> None:
     """The moments up to the end of a unit, from those up to its beginning."""
-    n, sx, sy, sxx, sxy, syy = 0, 0, 0, 0, 0, 0
-    for k in range(first, first + size):
-        there = np.int64(1) - bridged[k]
-        x, y = np.int64(columns[k]), np.int64(rows[k])
-        n, sx, sy = n + there, sx + there * x, sy + there * y
-        sxx, sxy, syy = sxx + there * x * x, sxy + there * x * y, syy + there * y * y
+    n, sx, sy, sxx, sxy, syy = moments_of(columns, rows, bridged)
     put_down(sums, unit + 1, n + sums[unit, 0], sx + sums[unit, 1], sy + sums[unit, 2], sxx + sums[unit, 3],
              sxy + sums[unit, 4], syy + sums[unit, 5])
 
@@ -173,18 +157,14 @@ def end_of_stretch(sums: Any, unit: int, units: int, weight: float) -> int:
 
 
 @inlined
-def describe(columns: Any, rows: Any, codes: Any, blob: Any) -> None:
-    """Fill in the attributes of a stretch; of codes that are equally frequent the lower one counts."""
-    left, right, top, bottom = columns[0], columns[0], rows[0], rows[0]
+def most_frequent(codes: Any) -> int:
+    """The code that most of some pixels have; of those that are equally frequent the lower one."""
     counts: Any = np.int64(0)
-    for k in range(columns.size):
-        left, right = min(left, columns[k]), max(right, columns[k])
-        top, bottom = min(top, rows[k]), max(bottom, rows[k])
+    for k in range(codes.size):
         counts += 1 << 15 * (np.int64(codes[k]) - 1)
-    most: Any = -1
+    found, most = 0, -1
     for code in range(1, 5):
         if counts >> 15 * (code - 1) & 0x7FFF > most:
             most = counts >> 15 * (code - 1) & 0x7FFF
-            blob['dir'] = code
-    blob['select'], blob['size'] = True, columns.size
-    blob['min_row'], blob['max_row'], blob['min_col'], blob['max_col'] = top, bottom, left, right
+            found = code
+    return found

@@ -41,6 +41,8 @@ class Team:
         Raises:
             What `work` raises: of several errors one.
         """
+        if self.size == 1:
+            return [work(*piece, *tools[:1]) for piece in pieces]
         todo = deque(enumerate(pieces))
         results: dict[int, T] = {}
 
