@@ -79,6 +79,7 @@ colcon: $(VENV)/.colcon
 # Accuracy and speed beside OpenCV's detectors, as tables, and curves in bench/results.
 bench: $(PEERS)/.installed
 	$(PEERS)/bin/python bench/accuracy.py --seed $(SEED) $(if $(YORK),--york "$(YORK)") --results bench/results
+	$(PEERS)/bin/python bench/angles.py --seed $(SEED)
 	$(PEERS)/bin/python bench/speed.py $(PHOTOS) --results bench/results
 	$(PEERS)/bin/python bench/cold_start.py
 

@@ -43,8 +43,8 @@ def compare(
         truth: M×4, true segments.
         weak: K×4, true segments too faint or too short to ask for: what matches only these is not counted.
     """
-    matched, low, high, offset, angle = _match(segments, truth)
-    counted = matched.any(1) | (True if weak is None else ~_match(segments, weak)[0].any(1))
+    matched, low, high, offset, angle = match(segments, truth)
+    counted = matched.any(1) | (True if weak is None else ~match(segments, weak)[0].any(1))
     shared = np.where(matched, high - low, 0.0)
     length, true_length = _lengths(segments), _lengths(truth)
     covered = sum(_union(low[matched[:, j], j], high[matched[:, j], j]) for j in range(len(truth)))
@@ -63,7 +63,7 @@ def _lengths(segments: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
 
 
-def _match(
+def match(
     segments: NDArray[np.floating], truth: NDArray[np.floating],
 ) -> tuple[NDArray[np.bool_], NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """For all pairs, N×M: match or not, the interval shared along the true one, offset of the middle, angle."""
