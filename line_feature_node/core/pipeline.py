@@ -22,7 +22,15 @@ from line_feature_node.core.linking import link_lines
 from line_feature_node.core.noise import adapted, correlation_length, gradient_noise, measure, step_response
 from line_feature_node.core.normalization import normalize_codes
 from line_feature_node.core.parameters import Parameters
-from line_feature_node.core.refinement import Guesses, Ridges, first_guesses, refine_lines
+from line_feature_node.core.refinement import (
+    Demands,
+    Guesses,
+    Ridges,
+    demands,
+    first_guesses,
+    grown_ahead,
+    refine_lines,
+)
 from line_feature_node.core.scanning import BRIDGED, TAKEN, Chains, chain_directions, joined, scan_edges, trace_edges
 from line_feature_node.core.selection import check_mask, enlarged, filled, placed, region, selected, smaller
 from line_feature_node.core.splitting import deviation_variance, split_chains
@@ -133,7 +141,7 @@ class LineFeatureExtractor:
     Attributes:
         parameters: What the next frame is extracted with; may be replaced between two frames.
         times: Seconds that each of STEPS took in the last frame that was extracted. What several threads do of it at
-            the same time, from scanning to the first look along the lines, counts as scanning.
+            the same time, from scanning to the growth of the lines, counts as scanning.
         unlinked: How many segments the last frame had before linking.
     """
 
@@ -263,14 +271,15 @@ class LineFeatureExtractor:
             segments = segments_of(lines, link_lines(lines, self.unlinked, grey.shape, p, buffers))
             watch('linking', None)
         else:
+            asked = demands(ridges, p, buffers)
             if team.size > 1 and p.grouping == 'straightness' and p.thinning != 'none':
-                guesses = shared_guesses(marks, grey.shape, noise, ridges, p, buffers, team, watch)
+                guesses = shared_guesses(marks, grey.shape, noise, ridges, asked, p, buffers, team, watch)
             else:
                 lines, count = lines_of_edges(marks, grey.shape, noise, p, buffers, watch)
                 watch('linking', None)
                 guesses = [first_guesses(lines, count, ridges, buffers)]
             self.unlinked = sum(part.strengths.size for part in guesses)
-            segments = refine_lines(guesses, ridges, p, buffers, team)
+            segments = refine_lines(guesses, ridges, asked, buffers)
         watch('refinement', segments)
         if not view.whole:
             segments = placed(segments, view.x, view.y, view.across, view.down)
@@ -317,12 +326,13 @@ def lines_of_edges(
 
 
 def shared_guesses(
-    marks: NDArray[np.uint8], shape: tuple[int, int], noise: float, ridges: Ridges, parameters: Parameters,
-    buffers: Buffers, team: Team, watch: Watch,
+    marks: NDArray[np.uint8], shape: tuple[int, int], noise: float, ridges: Ridges, asked: Demands,
+    parameters: Parameters, buffers: Buffers, team: Team, watch: Watch,
 ) -> list[Guesses]:
-    """Steps 2 to 5, and the look at the gradient along the lines, all at the same time.
+    """Steps 2 to 5, the look at the gradient along the lines, and their growth, all at the same time.
 
-    One of a team traces edges; the others make first guesses of them meanwhile. `watch` sees all when it is done.
+    One of a team traces edges; the others make first guesses of them meanwhile, and let them grow. `watch` sees all
+    when it is done.
     """
     parts: list[Chains] = []
 
@@ -335,7 +345,7 @@ def shared_guesses(
         p = parameters
         blobs = split_chains(chains, _deviation(noise, p), marks.shape[1], MARGIN, p.min_size, memory)
         lines = compute_lines(blobs, shape, p, memory)
-        return blobs, lines, first_guesses(*lines, ridges, memory)
+        return blobs, lines, grown_ahead(first_guesses(*lines, ridges, memory), ridges, asked, memory)
 
     blobs, lines, guesses = zip(*team.pipe(guess, traced()), strict=True)
     chains = joined(parts)

@@ -13,7 +13,7 @@ lines, y for steep ones. All along it is looked at in whole steps of p.
 """
 
 import math
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from line_feature_node.core.buffers import Buffers
 from line_feature_node.core.compiling import inlined, kernel
 from line_feature_node.core.features import SEGMENT_DTYPE, VERTICAL, points_up
 from line_feature_node.core.parameters import Parameters
-from line_feature_node.core.team import Team
 from line_feature_node.core.vectors import (
     CACHE_LINE,
     STEPS,
@@ -40,8 +39,6 @@ from line_feature_node.core.vectors import (
     where,
 )
 
-#: Where lines are in a list. By this name, as the type of an argument of a function within one is made at each call.
-Places: TypeAlias = NDArray[np.int64]
 #: A line while it grows.
 RIDGE_DTYPE = np.dtype([
     ('steep', np.bool_),                                # whether p is y
@@ -157,16 +154,44 @@ class Ridges(NamedTuple):
     correlation: float
 
 
+class Demands(NamedTuple):
+    """What is asked of a line in a picture.
+
+    Attributes:
+        rarities: Of the norms of the picture's gradients, by their bins; the extractor's own.
+        strength: What its response by root of length must be.
+        evidence: What -l log10 H must be, for its length l and the share H of the pixels that have such a gradient.
+        tests: log10 of the number of lines that can be drawn.
+    """
+
+    rarities: NDArray[np.float64]
+    strength: float
+    evidence: float
+    tests: float
+
+
 class Guesses(NamedTuple):
     """First guesses. The arrays are the extractor's own.
 
     Attributes:
         ridges: RIDGE_DTYPE.
         strengths: float32, how clear each is.
+        grown: RIDGE_DTYPE, what became of each that has grown, as :func:`grow` leaves them; the guesses themselves
+            where none has.
     """
 
     ridges: NDArray[np.void]
     strengths: NDArray[np.float32]
+    grown: NDArray[np.void]
+
+
+def demands(ridges: Ridges, parameters: Parameters, buffers: Buffers) -> Demands:
+    """What is asked of a line, by the picture; min_snr and false_alarms are used."""
+    rarities = buffers.array('rarities', NORM_BINS, np.float64)[:NORM_BINS]
+    rank_norms(ridges.gradient, ridges.pad, ridges.height, ridges.width,
+               buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS], rarities)
+    tests = 2 * math.log10(ridges.height * ridges.width)
+    return Demands(rarities, parameters.min_snr * ridges.noise, tests - math.log10(parameters.false_alarms), tests)
 
 
 def first_guesses(lines: NDArray[np.void], count: int, ridges: Ridges, buffers: Buffers) -> Guesses:
@@ -178,11 +203,33 @@ def first_guesses(lines: NDArray[np.void], count: int, ridges: Ridges, buffers: 
         ridges: The gradient.
         buffers: Memory to work in.
     """
-    guesses = Guesses(buffers.array('first ridges', count, RIDGE_DTYPE)[:count],
-                      buffers.array('strengths', count, np.float32)[:count])
+    first = buffers.array('first ridges', count, RIDGE_DTYPE)[:count]
+    strengths = buffers.array('strengths', count, np.float32)[:count]
     gradient = ridges.gradient
-    lay(lines, gradient.reshape(-1), gradient.shape[1], ridges.pad, ridges.height, ridges.width, *guesses)
+    lay(lines, gradient.reshape(-1), gradient.shape[1], ridges.pad, ridges.height, ridges.width, first, strengths)
+    return Guesses(first, strengths, first)
+
+
+def grown_ahead(guesses: Guesses, ridges: Ridges, asked: Demands, buffers: Buffers) -> Guesses:
+    """Let part of a picture's guesses grow, those that need it as far as that part can tell."""
+    grown = buffers.array('grown', guesses.ridges.size, RIDGE_DTYPE)[:guesses.ridges.size]
+    grown.view(np.uint8)[:] = guesses.ridges.view(np.uint8)  # records would be copied field by field
+    guesses = guesses._replace(grown=grown)
+    grow_in_order(guesses, ridges, asked, buffers)
     return guesses
+
+
+def grow_in_order(guesses: Guesses, ridges: Ridges, asked: Demands, buffers: Buffers) -> NDArray[np.int64]:
+    """As :func:`grow`, strongest first, to 3 %; returns their places in that order."""
+    gradient, pad, height, width, noise = ridges[:5]
+    count, cells_twice = guesses.strengths.size, 2 * -(-height // CELL) * -(-width // CELL)
+    order = buffers.array('order', count, np.int64)[:count]
+    strongest_first(guesses.strengths.view(np.uint32), buffers.array('strength counts', KEYS, np.int64)[:KEYS], order)
+    grow(order, guesses.ridges, asked.rarities, (asked.strength, asked.evidence), gradient.reshape(-1),
+         gradient.shape[1], pad, height, width, noise,
+         buffers.array('claims', cells_twice, np.uint8)[:cells_twice],
+         buffers.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32), guesses.grown)
+    return order
 
 
 def joined_guesses(parts: list[Guesses], buffers: Buffers) -> Guesses:
@@ -190,53 +237,38 @@ def joined_guesses(parts: list[Guesses], buffers: Buffers) -> Guesses:
     if len(parts) == 1:
         return parts[0]
     strengths = np.concatenate([part.strengths for part in parts])
-    ridges = buffers.array('ridges', strengths.size, RIDGE_DTYPE)[:strengths.size]
+    ridges = together('ridges', [part.ridges for part in parts], buffers)
+    return Guesses(ridges, strengths, together('all grown', [part.grown for part in parts], buffers))
+
+
+def together(name: str, parts: list[NDArray[np.void]], buffers: Buffers) -> NDArray[np.void]:
+    """All lines of some lists, in memory of a name."""
+    size = sum(part.size for part in parts)
+    lines = buffers.array(name, size, RIDGE_DTYPE)[:size]
     # Records would be copied field by field.
-    np.concatenate([part.ridges.view(np.uint8) for part in parts], out=ridges.view(np.uint8))
-    return Guesses(ridges, strengths)
+    np.concatenate([part.view(np.uint8) for part in parts], out=lines.view(np.uint8))
+    return lines
 
 
-def refine_lines(
-    parts: list[Guesses], ridges: Ridges, parameters: Parameters, buffers: Buffers, team: Team,
-) -> NDArray[np.void]:
+def refine_lines(parts: list[Guesses], ridges: Ridges, asked: Demands, buffers: Buffers) -> NDArray[np.void]:
     """Align, grow, claim and judge.
 
     Args:
         parts: First guesses.
         ridges: The gradient, and what is known of its noise.
-        parameters: min_snr and false_alarms are used.
+        asked: What is asked of a line.
         buffers: Memory to work in.
-        team: Who does the work.
 
     Returns:
         SEGMENT_DTYPE, strongest first guess first, to 3 %, a new array.
     """
-    gradient, pad, height, width, noise, step, correlation = ridges
-    flat, stride = gradient.reshape(-1), gradient.shape[1]
-    grown, strengths = joined_guesses(parts, buffers)
-    order = buffers.array('order', strengths.size, np.int64)[:strengths.size]
-    strongest_first(strengths.view(np.uint32), buffers.array('strength counts', KEYS, np.int64)[:KEYS], order)
-    rarities = buffers.array('rarities', NORM_BINS, np.float64)[:NORM_BINS]
-    rank_norms(gradient, pad, height, width, buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS], rarities)
-    tests = 2 * math.log10(height * width)
-    least = parameters.min_snr * noise, tests - math.log10(parameters.false_alarms)
-    guesses, cells_twice = grown, 2 * -(-height // CELL) * -(-width // CELL)
-
-    def grow_some(some: Places, memory: Buffers) -> None:
-        claims = memory.array('claims', cells_twice, np.uint8)[:cells_twice]
-        values = memory.array('responses', 2 * (height + width) + 4 * MEMORY, np.float32)
-        grow(some, guesses, rarities, least, flat, stride, pad, height, width, noise, claims, values, grown)
-
-    if team.size > 1:
-        guesses = buffers.array('guesses', grown.size, RIDGE_DTYPE)[:grown.size]
-        guesses.view(np.uint8)[:] = grown.view(np.uint8)
-        # Neighbours in the list are so in the picture: in parts of the list most lines claim what they would in all.
-        team.each(grow_some, [(order[(order >= first) & (order < end)],) for first, end in team.shares(grown.size)],
-                  buffers.parts(team.size))
-    grow_some(order, buffers)
-    kept = judge(least, rarities, order, flat, stride, pad, height, width, grown)
+    gradient, pad, height, width, _, step, correlation = ridges
+    guesses = joined_guesses(parts, buffers)
+    order = grow_in_order(guesses, ridges, asked, buffers)
+    kept = judge((asked.strength, asked.evidence), asked.rarities, order, gradient.reshape(-1), gradient.shape[1], pad,
+                 height, width, guesses.grown)
     segments = np.empty(kept, SEGMENT_DTYPE)
-    write(order, grown, step, correlation, tests, rarities, segments)
+    write(order, guesses.grown, step, correlation, asked.tests, asked.rarities, segments)
     return segments
 
 
