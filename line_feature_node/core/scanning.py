@@ -240,7 +240,7 @@ def next_start(
         It, -1 where there is none; what it is beside, and the direction after it; the number of entries on the stack.
     """
     while True:
-        mask = open_neighbours(marks, beside, stride) >> direction
+        mask = open_neighbours(marks, beside, stride) >> direction if direction < 8 else 0
         if mask != 0:
             direction += LOWEST[mask]
             return beside + STEP_X[direction] + stride * STEP_Y[direction], beside, direction + 1, top
