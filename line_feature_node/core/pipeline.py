@@ -419,7 +419,7 @@ def _check(image: Any) -> None:
     """Raise what is wrong with an image."""
     if not isinstance(image, np.ndarray):
         raise TypeError(f'image must be a numpy array, got {type(image).__name__}')
-    if image.dtype.newbyteorder('=') not in PIXEL_TYPES:
+    if image.dtype.type not in PIXEL_TYPES:
         hint = ': use image.astype(numpy.float32)' if image.dtype == np.float64 else ''
         raise TypeError(f'image must be uint8, uint16 or float32, got {image.dtype}{hint}')
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))):

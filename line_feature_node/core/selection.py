@@ -1,5 +1,6 @@
 """What is looked at and what is kept: region of interest, mask and scale before the six steps, selection after them."""
 
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -13,6 +14,7 @@ from line_feature_node.core.parameters import RIGHT_ANGLE, Parameters
 REACH = 4
 
 
+@lru_cache(maxsize=64)
 def region(roi: tuple[float, float, float, float], width: int, height: int) -> tuple[int, int, int, int]:
     """The part of a picture that a region of interest covers: x, y, width and height in pixels.
 
