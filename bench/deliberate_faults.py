@@ -79,7 +79,7 @@ FAULTS = {
     ],
     'noise': [
         ('quantile(sums, (1 - share) * total)', 'quantile(sums, share * total)'),
-        ('+ 4 * np.float32(middle[i])', '+ 2 * np.float32(middle[i])'),
+        ('+ 4 * np.float32(middle[here])', '+ 2 * np.float32(middle[here])'),
         ('keep[row, i] and keep[row + 1, i]\n', 'keep[row, i]\n'),
         ('np.interp(noise, ALPHA_NOISE, ALPHA)', 'np.interp(noise, ALPHA_NOISE, ALPHA[::-1])'),
         ('gradient**2 - of_noise**2', 'gradient**2 + of_noise**2'),

@@ -104,7 +104,7 @@ def quantile(sums: NDArray[np.int64], wanted: float) -> float:
 @inlined
 def count(counts: Any, row: int, value: Any) -> None:
     """Count a value, rounded, in a row of the histograms; what is too large for them, or no number, in the last bin."""
-    counts[row, np.int64(value + np.float32(0.5)) if value < np.float32(BINS - 1) else BINS - 1] += 1
+    counts[row, np.uint64(value + np.float32(0.5)) if value < np.float32(BINS - 1) else np.uint64(BINS - 1)] += 1
 
 
 @kernel
@@ -130,14 +130,16 @@ def count_differences(image: Any, keep: Any, scale: float, sums: Any) -> int:
             if keep.size > 0 and not (keep[row - 1, i] and keep[row, i] and keep[row + 1, i]
                                       and keep[row, i - 1] and keep[row, i + 1]):
                 continue
-            left = np.float32(above[i - 1]) + np.float32(below[i - 1])
-            centre = np.float32(above[i]) + np.float32(below[i])
-            right = np.float32(above[i + 1]) + np.float32(below[i + 1])
-            west, east = np.float32(middle[i - 1]), np.float32(middle[i + 1])
-            second = left + right - 2 * (centre + west + east) + 4 * np.float32(middle[i])
+            # Unsigned indices spare the test whether to count from the end.
+            before, here, after = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1)
+            left = np.float32(above[before]) + np.float32(below[before])
+            centre = np.float32(above[here]) + np.float32(below[here])
+            right = np.float32(above[after]) + np.float32(below[after])
+            west, east = np.float32(middle[before]), np.float32(middle[after])
+            second = left + right - 2 * (centre + west + east) + 4 * np.float32(middle[here])
             across = right - left + 2 * (east - west)
-            along = (np.float32(below[i - 1]) - np.float32(above[i - 1]) + np.float32(below[i + 1])
-                     - np.float32(above[i + 1]) + 2 * (np.float32(below[i]) - np.float32(above[i])))
+            along = (np.float32(below[before]) - np.float32(above[before]) + np.float32(below[after])
+                     - np.float32(above[after]) + 2 * (np.float32(below[here]) - np.float32(above[here])))
             count(sums, 0, abs(second) * factor)
             count(sums, 1, np.sqrt(across * across + along * along) * factor)
             total += 1

@@ -65,16 +65,19 @@ def normalize_open(codes: Any, n: int) -> None:
     before, after = one(codes[0]), 0
     for i in range(1, min(n + 2, size)):
         after += one(codes[i])
+    old = codes[0]
     for k in range(size - 1):
-        old, new = codes[k], codes[k + 1]
+        new = kept = codes[k + 1]
         if old != new and takes_code_before(before, after, min(k, n) + 1, min(n + 1, size - k - 1), old, new):
-            codes[k + 1] = old
+            kept = codes[k + 1] = old
         after -= one(new)
+        # Unsigned indices spare the test whether to count from the end.
         if k + n + 2 < size:
-            after += one(codes[k + n + 2])
-        before += one(codes[k + 1])
+            after += one(codes[np.uint64(k + n + 2)])
+        before += one(kept)
         if k >= n:
-            before -= one(codes[k - n])
+            before -= one(codes[np.uint64(k - n)])
+        old = kept
 
 
 @kernel

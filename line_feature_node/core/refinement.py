@@ -918,8 +918,10 @@ def count_norms(gradient: Any, pad: int, height: int, width: int, counts: Any) -
         if row >= height:
             continue
         for column in range(k % turns, width, turns):
-            x, y = gradient[row + pad, column + pad, 0], gradient[row + pad, column + pad, 1]
-            counts[norm_bin(math.sqrt(np.float32(x) * x + np.float32(y) * y))] += 1
+            # Unsigned indices spare the test whether to count from the end.
+            down, right = np.uint64(row + pad), np.uint64(column + pad)
+            x, y = gradient[down, right, 0], gradient[down, right, 1]
+            counts[np.uint64(norm_bin(math.sqrt(np.float32(x) * x + np.float32(y) * y)))] += 1
     for k in range(counts.size - 2, -1, -1):
         counts[k] += counts[k + 1]
 

@@ -384,9 +384,9 @@ def faces_ends(pixel: int, steps: Any, count: int, marks: Any, stride: int) -> b
     """Whether there is an end of a chain at any of so many steps from a pixel."""
     seen = 0
     for k in range(count):
-        target = np.int64(pixel) + steps[k, 0] + steps[k, 1] * stride
         # As an unsigned number what is before the marks is far behind them.
-        seen |= marks[target] if np.uint64(target) < np.uint64(marks.size) else 0
+        target = np.uint64(np.int64(pixel) + steps[k, 0] + steps[k, 1] * stride)
+        seen |= marks[target] if target < np.uint64(marks.size) else 0
     return seen & ENDING != 0
 
 
@@ -508,15 +508,22 @@ def append(
     """Copy a raw chain, beginning with the given end of it."""
     first, last = raw_offsets[end // 2], raw_offsets[end // 2 + 1]
     total = length + last - first
-    for k in range(length, total):
-        bridged[k] = False
-    for k in range(last - first):
-        pixels[length + k] = raw_pixels[first + k]
-    for k in range(last - first):
-        codes[length + k] = raw_codes[first + k]
+    copy(raw_pixels[first:last], raw_codes[first:last], pixels[length:total], codes[length:total],
+         bridged[length:total])
     if end % 2 == 1:
         reverse(pixels, codes, length, total)
     return total
+
+
+@inlined
+def copy(raw_pixels: Any, raw_codes: Any, pixels: Any, codes: Any, bridged: Any) -> None:
+    """Copy pixels and codes, which fill no gap; slices spare the test whether to count from the end."""
+    for k in range(pixels.size):
+        bridged[k] = False
+    for k in range(pixels.size):
+        pixels[k] = raw_pixels[k]
+    for k in range(pixels.size):
+        codes[k] = raw_codes[k]
 
 
 @inlined
