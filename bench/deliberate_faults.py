@@ -129,6 +129,7 @@ FAULTS = {
         ('floats(s * stride) - half', 'floats(s * stride) + half'),
         ('numbers <= farthest - known', 'numbers < farthest - known'),
         ('upper * second + lower * across', 'lower * second + upper * across'),
+        ('deviations(line, correlation)[0] <= sigma_theta', 'deviations(line, correlation)[1] <= sigma_theta'),
     ],
     'scanning': [
         ('back = -1 if right else 1', 'back = 1 if right else -1'),

@@ -25,9 +25,10 @@ OTHERS = {
     'operator': 'sobel', 'alpha': 2.5, 'sigma': 2.0, 'T1': 9.5, 'T2': 2.5, 'noise_T1': 3.0, 'noise_T2': 1.5,
     'clutter': 1.5, 'intensity_min': -5.0, 'intensity_max': 9.0, 'thinning': 'none', 'max_gap': 1, 'min_chain': 9,
     'n': 7, 'grouping': 'codes', 'min_size': 6, 'orientation': 'least_squares', 'tau1': 1.5, 'tau2': 7.5,
-    'refine': False, 'min_snr': 9.0, 'false_alarms': 0.5, 'min_length': 3.5, 'max_segments': 11, 'theta_min': -0.5,
-    'theta_max': 0.5, 'roi': [0.0, 0.5, 1.0, 0.5], 'scale': 0.5, 'threads': 3, 'profile': 'paper', 'lazy': False,
-    'jpeg_quality': 55, 'image_timeout': 3.5, 'max_latency': 0.5, 'max_dropped': 0.5,
+    'refine': False, 'min_snr': 9.0, 'false_alarms': 0.5, 'max_sigma_theta': 0.1, 'min_length': 3.5,
+    'max_segments': 11, 'theta_min': -0.5, 'theta_max': 0.5, 'roi': [0.0, 0.5, 1.0, 0.5], 'scale': 0.5, 'threads': 3,
+    'profile': 'paper', 'lazy': False, 'jpeg_quality': 55, 'image_timeout': 3.5, 'max_latency': 0.5,
+    'max_dropped': 0.5,
 }
 RUNNING = [name for name, spec in TABLES.items() if not spec.constant]
 

@@ -128,7 +128,7 @@ def test_float_for_a_whole_number_is_refused(name: str, value: float) -> None:
 def test_numbers_of_any_type(name: str, kind: type) -> None:
     """Whole numbers and numpy's scalars will do for a number, which is kept as a float."""
     value = {'alpha': 2, 'sigma': 2, 'T2': 3, 'intensity_max': 100, 'tau1': 9, 'theta_min': 1, 'theta_max': 1,
-             'scale': 1}.get(name, 50)
+             'scale': 1, 'max_sigma_theta': 1}.get(name, 50)
     given = kind(value)
     kept = getattr(Parameters(**{name: given}), name)
     assert kept == value

@@ -858,6 +858,7 @@ def check_segments(segments: npt.NDArray[np.void], height: int, width: int, para
             assert (segments[name] >= 0).all(), name
         assert np.isin(segments['polarity'], [-1, 1]).all()
         assert (segments['log_nfa'] <= math.log10(parameters.false_alarms) + 1e-4).all()
+        assert (segments['sigma_theta'] <= np.float32(parameters.max_sigma_theta)).all()
         assert (segments['size'] > 0).all()
     else:
         for name in OF_REFINED:
@@ -997,7 +998,8 @@ beyond_the_paper = st.fixed_dictionaries({}, optional={
     'alpha': st.just(math.nan), 'noise_T1': st.floats(0, 100), 'noise_T2': st.floats(0, 100),
     'clutter': st.floats(1, 100),
     'grouping': st.sampled_from(['codes', 'straightness']), 'refine': st.booleans(), 'min_snr': st.floats(0, 100),
-    'false_alarms': st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), 'operator': st.just('sobel'),
+    'false_alarms': st.sampled_from([1e-30, 1e-3, 1.0, 1e30]), 'max_sigma_theta': st.sampled_from([0.0, 0.01, 10.0]),
+    'operator': st.just('sobel'),
     'thinning': st.sampled_from(['morphological', 'none']), 'min_chain': st.integers(1, 12),
     'min_size': st.integers(2, 12), 'max_gap': st.integers(0, 8)})
 

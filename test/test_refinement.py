@@ -555,7 +555,7 @@ def test_negative_of_a_picture_has_the_opposite_polarities() -> None:
 
 @pytest.mark.compiled
 @pytest.mark.parametrize('seed', range(3))
-def test_more_alarms_and_less_clearness_let_more_through(seed: int) -> None:
+def test_more_alarms_less_clearness_and_less_certainty_let_more_through(seed: int) -> None:
     """What is accepted meets what was asked for."""
     image = scene(150, 200, seed=seed, sigma=15)
     counts = [len(extract(image, false_alarms=alarms)) for alarms in (1e-30, 1e-6, 0.1, 1e6)]
@@ -564,6 +564,11 @@ def test_more_alarms_and_less_clearness_let_more_through(seed: int) -> None:
     assert counts == sorted(counts)
     for alarms in (1e-6, 0.1):
         assert (extract(image, false_alarms=alarms)['log_nfa'] <= math.log10(alarms) + 1e-4).all()
+    every = extract(image, max_sigma_theta=10.0)
+    for sigma in (0.0, 0.002, 0.02):
+        certain = every[every['sigma_theta'] <= np.float32(sigma)]
+        assert extract(image, max_sigma_theta=float(np.float32(sigma))).tobytes() == certain.tobytes()
+    assert 0 < np.count_nonzero(every['sigma_theta'] <= 0.002) < len(every)
 
 
 # Masks

@@ -176,6 +176,10 @@ class Parameters(ParameterSet):
     false_alarms: float = parameter(
         0.1, 'Refined segments are dropped where so many as clear as they are expected by chance in a picture whose '
         'gradients have no order.', low=1e-30, high=1e30)
+    max_sigma_theta: float = parameter(
+        0.0175, 'Refined segments are dropped where the standard deviation of their orientation is more than this: by '
+        'default a degree.',
+        low=0.0, high=10.0, unit='radians')
     min_length: float = parameter(
         0.0, 'Shorter segments are dropped in the end.', low=0.0, high=100000.0, unit='pixels')
     max_segments: int = parameter(

@@ -162,12 +162,14 @@ class Demands(NamedTuple):
         strength: What its response by root of length must be.
         evidence: What -l log10 H must be, for its length l and the share H of the pixels that have such a gradient.
         tests: log10 of the number of lines that can be drawn.
+        sigma_theta: The largest standard deviation that its orientation may have.
     """
 
     rarities: NDArray[np.float64]
     strength: float
     evidence: float
     tests: float
+    sigma_theta: float
 
 
 class Guesses(NamedTuple):
@@ -186,12 +188,13 @@ class Guesses(NamedTuple):
 
 
 def demands(ridges: Ridges, parameters: Parameters, buffers: Buffers) -> Demands:
-    """What is asked of a line, by the picture; min_snr and false_alarms are used."""
+    """What is asked of a line, by the picture; min_snr, false_alarms and max_sigma_theta are used."""
     rarities = buffers.array('rarities', NORM_BINS, np.float64)[:NORM_BINS]
     rank_norms(ridges.gradient, ridges.pad, ridges.height, ridges.width,
                buffers.array('norm counts', NORM_BINS, np.int64)[:NORM_BINS], rarities)
     tests = 2 * math.log10(ridges.height * ridges.width)
-    return Demands(rarities, parameters.min_snr * ridges.noise, tests - math.log10(parameters.false_alarms), tests)
+    return Demands(rarities, parameters.min_snr * ridges.noise, tests - math.log10(parameters.false_alarms), tests,
+                   parameters.max_sigma_theta)
 
 
 def first_guesses(lines: NDArray[np.void], count: int, ridges: Ridges, buffers: Buffers) -> Guesses:
@@ -265,8 +268,8 @@ def refine_lines(parts: list[Guesses], ridges: Ridges, asked: Demands, buffers: 
     gradient, pad, height, width, _, step, correlation = ridges
     guesses = joined_guesses(parts, buffers)
     order = grow_in_order(guesses, ridges, asked, buffers)
-    kept = judge((asked.strength, asked.evidence), asked.rarities, order, gradient.reshape(-1), gradient.shape[1], pad,
-                 height, width, guesses.grown)
+    kept = judge((asked.strength, asked.evidence), asked.sigma_theta, asked.rarities, correlation, order,
+                 gradient.reshape(-1), gradient.shape[1], pad, height, width, guesses.grown)
     segments = np.empty(kept, SEGMENT_DTYPE)
     write(order, guesses.grown, step, correlation, asked.tests, asked.rarities, segments)
     return segments
@@ -947,10 +950,10 @@ def is_clear(line: Any, rarities: Any, least_strength: float, least_evidence: fl
 
 @kernel
 def judge(
-    least: tuple[float, float], rarities: Any, order: Any, gradient: Any, stride: int, pad: int, height: int,
-    width: int, grown: Any,
+    least: tuple[float, float], sigma_theta: float, rarities: Any, correlation: float, order: Any, gradient: Any,
+    stride: int, pad: int, height: int, width: int, grown: Any,
 ) -> int:
-    """Drop the lines that are too short or not clear enough from the order; return how many are left.
+    """Drop the lines that are too short, not clear or not certain enough from the order; return how many are left.
 
     What a line left to others does not count: it is judged, and told of, by what there is along the rest.
     """
@@ -964,10 +967,21 @@ def judge(
         if line['begin'] > line['first'] or line['end'] < line['last']:
             line['first'], line['last'], line['size'] = line['begin'], line['end'], 0
             align_to_peaks(line, gradient, axes_of(line, stride, pad, height, width), 0.0)
-        if line['size'] > 0 and length_of(line) >= SHORTEST and is_clear(line, rarities, least[0], least[1]):
+        if (line['size'] > 0 and length_of(line) >= SHORTEST and is_clear(line, rarities, least[0], least[1])
+                and deviations(line, correlation)[0] <= sigma_theta):
             order[left] = order[place]
             left += 1
     return left
+
+
+@inlined
+def deviations(line: Any, correlation: float) -> tuple[float, float]:
+    """Standard deviations of the orientation of a line, radians, and of its position across it, pixels."""
+    scale = 1 / math.sqrt(1 + line['slope'] * line['slope'])
+    # Noise of neighbouring peaks is smoothed along the edge: so many of them count as one.
+    together = max(INDEPENDENT * correlation * scale, 1.0)
+    variance = together * max(line['variance'], LEAST_VARIANCE)
+    return math.sqrt(variance / line['moment']) * scale * scale, math.sqrt(variance / line['size']) * scale
 
 
 @kernel
@@ -999,11 +1013,7 @@ def write(
         # The code of the gradient's direction, a quarter of a turn on, by sections about multiples of 45 degrees.
         segment['code'] = math.floor(theta / (np.pi / 4) + 2.5) % 4 + 1
         segment['size'] = line['size']
-        # Noise of neighbouring peaks is smoothed along the edge: so many of them count as one.
-        together = max(INDEPENDENT * correlation * scale, 1.0)
-        variance = max(line['variance'], LEAST_VARIANCE)
-        segment['sigma_theta'] = math.sqrt(together * variance / line['moment']) * scale * scale
-        segment['sigma_offset'] = math.sqrt(together * variance / line['size']) * scale
+        segment['sigma_theta'], segment['sigma_offset'] = deviations(line, correlation)
         segment['contrast'] = line['response'] / step
         segment['polarity'] = -line['sign'] if line['steep'] and not turned else line['sign']
         segment['log_nfa'] = tests - length_of(line) * rarity(line['response'], rarities)
