@@ -4,13 +4,15 @@
 
 No unbiased estimate of an edge's angle errs by less than the bound of Cramér and Rao: with g the gradient of the
 picture without noise across the edge, t the place of a pixel along it and t0 their mean, weighted by g^2, its variance
-is at least sigma^2 over the sum of g^2 (t - t0)^2 of all pixels near the edge, whoever knows the picture but for that
-angle. The scenes are those of bench/accuracy.py. The bound is given for the part of an edge that a segment covers,
-without the two pixels at either end where corners bend it, and for the whole edge, as if corners did not exist. Errors
-and bounds are medians over the same segments, those that match an edge.
+is at least sigma^2 over the sum of g^2 (t - t0)^2 of all pixels near the edge, whoever knows the picture but for the
+angle and the position of that edge. The scenes are those of bench/accuracy.py. The least median error is that of normal
+errors with these bounds as their deviations: for the part of an edge that a segment covers, without the two pixels at
+either end where corners bend it, and for the whole edge, as if corners did not exist. The same segments count for all,
+those that match an edge.
 """
 
 import argparse
+from statistics import NormalDist
 
 import cv2
 import numpy as np
@@ -23,8 +25,8 @@ from line_feature_node.truth import match
 SIGMAS = (5, 10, 20, 30)
 #: Pixels this near to an edge tell of its angle, and at its ends so many do not.
 NEAR, CORNER = 4.0, 2.0
-#: The median of the magnitude of a normal error of standard deviation 1.
-MEDIAN = 0.6745
+#: Magnitudes of normal errors of deviation 1, each as likely as the others.
+NORMAL = np.array([NormalDist().inv_cdf(0.5 + (k + 0.5) / 2000) for k in range(1000)])
 #: Rows and columns repeated around a picture before it is differentiated.
 AROUND = 64
 
@@ -71,6 +73,11 @@ def errors(found: Lines, true: Lines, slopes: NDArray[np.float64], sigma: float)
     return rows
 
 
+def median_error(deviations: NDArray[np.float64]) -> float:
+    """The median of the magnitudes of normal errors of these standard deviations."""
+    return float(np.median(NORMAL[:, None] * deviations))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--seed', type=int, default=0)
@@ -87,8 +94,8 @@ def main() -> None:
                 for row in errors(end_points(extractor.extract(with_noise(image, sigma, number))), true,
                                   slopes[number], sigma)]
         angle, least, whole = np.degrees(rows).T
-        print(f'| {sigma} | {len(rows)} | {np.median(angle):.3f} | {MEDIAN * np.median(least):.3f} | '
-              f'{np.median(angle / least) / MEDIAN:.2f} | {MEDIAN * np.median(whole):.3f} |')
+        print(f'| {sigma} | {len(rows)} | {np.median(angle):.3f} | {median_error(least):.3f} | '
+              f'{np.median(angle) / median_error(least):.2f} | {median_error(whole):.3f} |')
 
 
 if __name__ == '__main__':

@@ -75,6 +75,7 @@ def test_thick_edges_hold_what_suppression_leaves(profile, seed):
 def test_thick_edges_have_no_chains_and_blobs_of_all_pixels(profile):
     stages = LineFeatureExtractor(Parameters.profile(profile, thinning='none')).stages(picture())
     assert stages.chain_offsets.tolist() == [0]
+    assert (stages.chain_directions == 255).all()
     assert len(stages.blob_pixels) == (stages.edges != 0).sum() > 0
     np.testing.assert_array_equal(stages.codes_before, stages.codes_after)
     for code in (1, 2, 3, 4):

@@ -271,12 +271,13 @@ class LineFeatureExtractor:
             segments = segments_of(lines, link_lines(lines, self.unlinked, grey.shape, p, buffers))
             watch('linking', None)
         else:
-            asked = demands(ridges, p, buffers)
             if team.size > 1 and p.grouping == 'straightness' and p.thinning != 'none':
+                asked = demands(ridges, p, buffers)
                 guesses = shared_guesses(marks, grey.shape, noise, ridges, asked, p, buffers, team, watch)
             else:
                 lines, count = lines_of_edges(marks, grey.shape, noise, p, buffers, watch)
                 watch('linking', None)
+                asked = demands(ridges, p, buffers)
                 guesses = [first_guesses(lines, count, ridges, buffers)]
             self.unlinked = sum(part.strengths.size for part in guesses)
             segments = refine_lines(guesses, ridges, asked, buffers)

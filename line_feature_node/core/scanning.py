@@ -197,8 +197,8 @@ def joined(parts: list[Chains]) -> Chains:
 
 
 def chain_directions(chains: Chains, stride: int) -> NDArray[np.uint8]:
-    """The chain code: the direction from each pixel to the next; 255 at the end of an open chain."""
-    directions = np.empty(chains.pixels.size, np.uint8)
+    """The chain code: the direction from each pixel to the next; END at the end of an open chain, or without chains."""
+    directions = np.full(chains.pixels.size, END, np.uint8)
     write_directions(chains.pixels, chains.offsets, chains.closed, stride, directions)
     return directions
 
@@ -408,7 +408,7 @@ def facing_end(
         # A step over the margin leads to the other side of the image.
         if other == end or links[other] != -1 or not 0 <= pixel % stride + step < stride:
             continue
-        facing = (directions[other] - direction + 4 + 1) % 8 <= 2
+        facing = (np.int64(directions[other]) - direction + 4 + 1) % 8 <= 2
         between = (np.int64(codes[index]) - codes[end_index(offsets, other)]) % 4
         if facing and between != 2 and take_gap(marks, pixel, target, gap, stride):
             return other
