@@ -979,8 +979,8 @@ def deviations(line: Any, correlation: float) -> tuple[float, float]:
     """Standard deviations of the orientation of a line, radians, and of its position across it, pixels."""
     scale = 1 / math.sqrt(1 + line['slope'] * line['slope'])
     # Noise of neighbouring peaks is smoothed along the edge: so many of them count as one.
-    together = max(INDEPENDENT * correlation * scale, 1.0)
-    variance = together * max(line['variance'], LEAST_VARIANCE)
+    as_one = max(INDEPENDENT * correlation * scale, 1.0)
+    variance = as_one * max(line['variance'], LEAST_VARIANCE)
     return math.sqrt(variance / line['moment']) * scale * scale, math.sqrt(variance / line['size']) * scale
 
 
